@@ -1,0 +1,156 @@
+"""The few shapes and promises that every room of the package shares.
+
+Letters: B batch · K chunk length (50) · A action dim (14) · S state dim (14) · V cameras (3) · H, W image ·
+D hidden · N memory tokens · M refinement budget. Both vectors are ordered
+[left arm 6 (rad), left gripper (0 closed .. 1 open), right arm 6 (rad), right gripper].
+"""
+
+from abc import ABC, abstractmethod
+from dataclasses import asdict, dataclass, field
+from typing import Any, NamedTuple
+
+from torch import Tensor, nn
+
+from ugr_lightning.blueprint import Blueprinted
+
+CAMERAS: tuple[str, ...] = ("cam_high", "cam_right_wrist", "cam_left_wrist")
+STATE_DIM = 14
+ACTION_DIM = 14
+CHUNK_LENGTH = 50
+
+
+class Observation(NamedTuple):
+    """What a policy sees at one control step.
+
+    Args:
+        images: (B, V, 3, H, W) uint8 RGB, cameras in the order of the policy's `cameras`.
+        state: (B, S) float32, commanded joints in robot units.
+    """
+
+    images: Tensor
+    state: Tensor
+
+
+class Batch(NamedTuple):
+    """Observations with the action chunks that followed them in a demonstration.
+
+    Args:
+        images: (B, V, 3, H, W) uint8 RGB.
+        state: (B, S) float32, robot units.
+        actions: (B, K, A) float32, robot units; steps past the end repeat the last action.
+        valid: (B, K) bool, False on steps past the end of the episode.
+        episode: (B,) int64, index of the episode in the data set.
+        step: (B,) int64, time step of the observation in its episode.
+    """
+
+    images: Tensor
+    state: Tensor
+    actions: Tensor
+    valid: Tensor
+    episode: Tensor
+    step: Tensor
+
+    @property
+    def observation(self) -> Observation:
+        """The part of the batch that a policy also has at run time."""
+        return Observation(self.images, self.state)
+
+
+class Chunk(NamedTuple):
+    """A policy's plan for the next K control steps.
+
+    Args:
+        actions: (B, K, A) float32, robot units; what the robot executes.
+        coarse: (B, K, A) float32, robot units, before refinement; None where a policy does not refine.
+        log_variance: (B, K) float32, predicted uncertainty s_k; None where a policy has none.
+        refined: (B, K) bool, steps that received a correction; None where a policy does not refine.
+    """
+
+    actions: Tensor
+    coarse: Tensor | None = None
+    log_variance: Tensor | None = None
+    refined: Tensor | None = None
+
+
+class Statistics(NamedTuple):
+    """Per-dimension statistics of the training episodes, in robot units.
+
+    Args:
+        state_mean, state_std, state_min, state_max: (S,) float32.
+        action_mean, action_std, action_min, action_max: (A,) float32.
+    """
+
+    state_mean: Tensor
+    state_std: Tensor
+    state_min: Tensor
+    state_max: Tensor
+    action_mean: Tensor
+    action_std: Tensor
+    action_min: Tensor
+    action_max: Tensor
+
+
+class ChunkPolicy(Blueprinted, nn.Module, ABC):
+    """A policy that predicts action chunks; robot units in, robot units out.
+
+    Normalisation lives inside the policy as buffers, so that a checkpoint is complete by itself. A base class and not
+    a `typing.Protocol`, because Lightning needs a module and jsonargparse resolves `class_path` by subclass.
+    """
+
+    cameras: tuple[str, ...]
+    chunk_length: int
+    state_dim: int
+    action_dim: int
+
+    @abstractmethod
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Store the normalisation statistics in the policy's buffers."""
+
+    @abstractmethod
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """Named scalar loss terms of a batch; `loss` is the one to minimise, all others are for the log."""
+
+    @abstractmethod
+    def predict(self, observation: Observation) -> Chunk:
+        """The chunk to execute, without gradients and without randomness."""
+
+
+@dataclass
+class EpisodeResult:
+    """One closed-loop episode, as written to a results file (one JSON line each).
+
+    Args:
+        task: task name.
+        setting: scene setting, `demo_clean` or `demo_randomized`.
+        seed: simulator seed.
+        seeds_hash: SHA-256 of the seed list the episode belongs to.
+        policy: what acted: a checkpoint's policy class, or `zero`, `random`, `expert`.
+        checkpoint: SHA-256 of the checkpoint file, or None.
+        execution: `aggregate`, or the number of steps executed of each chunk.
+        success: whether the task's condition was met before the horizon; a crashed episode has False.
+        steps: control steps executed.
+        first_success_step: first step at which the condition was met, or None.
+        log_variance: summary of s_k over the episode (mean, max), empty where the policy has none.
+        seconds: wall-clock seconds by part (`query`, `simulate`).
+        video: path of the recorded video, or None.
+        crash: why the simulator or the policy failed, or None.
+    """
+
+    task: str
+    setting: str
+    seed: int
+    seeds_hash: str
+    policy: str
+    checkpoint: str | None
+    execution: str
+    success: bool
+    steps: int
+    first_success_step: int | None = None
+    log_variance: dict[str, float] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    video: str | None = None
+    crash: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain containers, ready for JSON."""
+        return asdict(self)

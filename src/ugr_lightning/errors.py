@@ -1,0 +1,43 @@
+"""Every error a user can meet: where it happened, what was expected, what was found, and what to do about it."""
+
+
+class UGRError(Exception):
+    """A problem that the user can solve; printed as one paragraph, never as a traceback.
+
+    Args:
+        where: file, key, setting or component in which the problem was found.
+        expected: what should have been there.
+        got: what was there.
+        fix: what to do, as a sentence; a command where there is one.
+    """
+
+    def __init__(self, where: object, expected: object, got: object, fix: str) -> None:
+        self.where, self.expected, self.got, self.fix = str(where), str(expected), str(got), fix
+        super().__init__(where, expected, got, fix)
+
+    def __str__(self) -> str:
+        return f"{self.where}: expected {self.expected}, got {self.got}. {self.fix}"
+
+
+class ConfigError(UGRError):
+    """A configuration value or a command-line argument that cannot work."""
+
+
+class DataError(UGRError):
+    """A demonstration file or folder that is missing, damaged or of another kind."""
+
+
+class CheckpointError(UGRError):
+    """A checkpoint that is missing, damaged, unsafe or made for something else."""
+
+
+class SimulationError(UGRError):
+    """A simulator that cannot start, hangs or has crashed."""
+
+
+class RenderError(SimulationError):
+    """No Vulkan device that SAPIEN can render with."""
+
+
+class NumericsError(UGRError):
+    """A NaN or infinity in a loss, an observation or an action."""
