@@ -66,7 +66,8 @@ def rebuild(blueprint: dict[str, Any]) -> Any:
     try:
         found = getattr(importlib.import_module(module), name)
     except (ImportError, AttributeError, ValueError) as error:
-        raise CheckpointError("class_path", "an importable class", path, f"Install what provides it ({error}).") from error
+        fix = f"Install what provides it ({error})."
+        raise CheckpointError("class_path", "an importable class", path, fix) from error
     if not (isinstance(found, type) and issubclass(found, Blueprinted)):
         raise CheckpointError("class_path", "a class made for checkpoints", path, "Use a checkpoint from `ugr fit`.")
     return found(**{name: _revive(value) for name, value in blueprint.get("init_args", {}).items()})
