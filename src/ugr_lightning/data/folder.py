@@ -1,0 +1,125 @@
+"""The folder of one recording, `<root>/<task>/<setting>`: episode files and the lists beside them (FACTS 1.1)."""
+
+import json
+import os
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ugr_lightning.errors import DataError
+
+EPISODE_NAME = re.compile(r"episode_?(\d+)\.hdf5")
+
+
+def episode_path(folder: Path, index: int) -> Path:
+    """Where episode `index` belongs."""
+    return Path(folder) / "data" / f"episode{index}.hdf5"
+
+
+def find_episodes(folder: Path) -> dict[int, Path]:
+    """The episodes present, by index, in order.
+
+    Names `episode7`, `episode_7` and `episode_0000007` are understood; unfinished files (`.partial`) are not episodes.
+
+    Raises:
+        DataError: two files claim the same index.
+    """
+    found: dict[int, Path] = {}
+    for path in sorted((Path(folder) / "data").glob("episode*.hdf5")):
+        match = EPISODE_NAME.fullmatch(path.name)
+        if match is None:
+            continue
+        index = int(match[1])
+        if index in found:
+            got = f"{found[index].name} and {path.name}"
+            raise DataError(path.parent, f"one file for episode {index}", got, "Remove one of the two.")
+        found[index] = path
+    return dict(sorted(found.items()))
+
+
+def publish(path: Path, write: Callable[[Path], None]) -> None:
+    """Write a file so that it is either complete under its name or absent, also if the power fails.
+
+    Args:
+        path: final file; its folder is made.
+        write: writes the whole content to the path it is given, `<path>.partial`.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".partial")
+    write(partial)
+    with open(partial, "rb") as file:
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def write_seeds(folder: Path, seeds: Sequence[int]) -> None:
+    """Write `seed.txt`: the simulator seed of every episode, by index, separated by spaces."""
+    text = " ".join(str(int(seed)) for seed in seeds)
+    publish(Path(folder) / "seed.txt", lambda partial: _write_text(partial, text))
+
+
+def read_seeds(folder: Path) -> list[int]:
+    """The seeds in `seed.txt`; empty where there is none.
+
+    Raises:
+        DataError: something in it is not a whole number.
+    """
+    path = Path(folder) / "seed.txt"
+    if not path.is_file():
+        return []
+    words = path.read_text(errors="replace").split()
+    wrong = [word for word in words if not word.isdecimal()]
+    if wrong:
+        raise DataError(path, "whole numbers separated by spaces", wrong[0][:40], "Restore or remove the file.")
+    return [int(word) for word in words]
+
+
+def write_scene_info(folder: Path, scenes: Mapping[int, Mapping[str, Any]]) -> None:
+    """Write `scene_info.json`: by `episode_<index>`, what the scene looked like at reset."""
+    content = {f"episode_{index}": scenes[index] for index in sorted(scenes)}
+    publish(Path(folder) / "scene_info.json", lambda partial: _write_json(partial, content))
+
+
+def read_scene_info(folder: Path) -> dict[int, dict[str, Any]]:
+    """The content of `scene_info.json` by episode index; empty where there is none.
+
+    Raises:
+        DataError: not JSON of that kind.
+    """
+    path = Path(folder) / "scene_info.json"
+    if not path.is_file():
+        return {}
+    try:
+        content = json.loads(path.read_text())
+        return {int(name.removeprefix("episode_")): dict(scene) for name, scene in content.items()}
+    except (ValueError, TypeError, AttributeError) as error:
+        raise DataError(path, "JSON by `episode_<index>`", str(error), "Restore or remove the file.") from error
+
+
+def write_instructions(folder: Path, index: int, seen: Sequence[str], unseen: Sequence[str] = ()) -> None:
+    """Write `instructions/episode<index>.json`: what the robot is told to do, in words."""
+    content = {"seen": list(seen), "unseen": list(unseen)}
+    path = Path(folder) / "instructions" / f"episode{index}.json"
+    publish(path, lambda partial: _write_json(partial, content))
+
+
+def _write_text(path: Path, text: str) -> None:
+    path.write_text(text + "\n")
+
+
+def _write_json(path: Path, content: object) -> None:
+    _write_text(path, json.dumps(content, indent=2, default=_plain))
+
+
+def _plain(value: object) -> object:
+    if isinstance(value, (np.ndarray, np.generic)):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} cannot be written as JSON")

@@ -1,0 +1,267 @@
+"""RoboTwin 2.0's raw demonstrations (FACTS 1.1, 1.4): one HDF5 file per episode, written and read.
+
+Ours carry one more group, `ugr/`: the expert's intended command, measured joints, contacts, phases and slack.
+RoboTwin's own tools do not look at it; files of RoboTwin do not have it.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+
+from ugr_lightning.contract import ACTION_DIM, CAMERAS, STATE_DIM
+from ugr_lightning.data.episode import Episode, JpegFrames
+from ugr_lightning.data.folder import publish
+from ugr_lightning.data.hdf5 import (
+    FIX,
+    find_dataset,
+    has_key,
+    open_hdf5,
+    read_array,
+    read_strings,
+)
+from ugr_lightning.data.jpeg import encode_frame, jpeg_size
+from ugr_lightning.errors import ConfigError, DataError
+
+FORMAT_VERSION = 1
+MAX_PIXELS = 4096
+DISK_CAMERAS = {"cam_high": "head_camera", "cam_right_wrist": "right_camera", "cam_left_wrist": "left_camera"}
+CAMERA_PARAMETERS = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
+
+CameraParameters = Mapping[str, Mapping[str, np.ndarray]]
+
+
+def write_episode(
+    path: Path,
+    *,
+    images: np.ndarray | Sequence[Sequence[bytes]],
+    commanded: np.ndarray,
+    measured: np.ndarray,
+    endpose: np.ndarray,
+    contacts: np.ndarray,
+    expert_action: np.ndarray,
+    phase: Sequence[str],
+    slack: np.ndarray,
+    camera_parameters: CameraParameters | Sequence[CameraParameters],
+    task: str,
+    setting: str,
+    seed: int,
+    control_hz: float,
+    noise: Mapping[str, Any] | None = None,
+) -> None:
+    """Write one episode of N decision steps, hence N + 1 frames, so that it is either complete on disk or absent.
+
+    `commanded[t + 1]` is what was executed at step t, `expert_action[t]` what the expert wanted; they differ where
+    noise was injected, and the latter is the label that `read_episode` returns.
+
+    Args:
+        path: final file, see `data.folder.episode_path`; folders are made, and `<path>.partial` is renamed to it.
+        images: (N + 1, V, H, W, 3) uint8 RGB in the order of `contract.CAMERAS`; or N + 1 items of V JPEGs each, as
+            `data.jpeg.encode_frame` makes them, to keep memory low while recording.
+        commanded: (N + 1, 14) joint targets in force, robot units.
+        measured: (N + 1, 14) measured joints, robot units.
+        endpose: (N + 1, 2, 7) world pose of the left and right tool, x y z qw qx qy qz, m.
+        contacts: (N + 1, 2) bool, left and right fingers touch something.
+        expert_action: (N, 14) the expert's intended absolute command, robot units.
+        phase: N names of the motion that each step belongs to.
+        slack: (N,) how much execution noise each step tolerates, 0 to 1.
+        camera_parameters: N + 1 items of `Simulator.camera_parameters()`, or one for cameras that never move;
+            by camera name of `contract.CAMERAS`: intrinsic_cv (3, 3), extrinsic_cv (3, 4), cam2world_gl (4, 4).
+        task: task name.
+        setting: scene setting.
+        seed: simulator seed.
+        control_hz: decision steps per second.
+        noise: how noise was injected, plain values; None for none.
+
+    Raises:
+        DataError: an array of another shape, or NaN or infinity in one; nothing is written.
+
+    Source: FACTS 1.1, 1.4.
+    """
+    path, steps = Path(path), len(expert_action)
+    if steps < 1:
+        raise DataError(path, "at least one step", "none", "Record a longer episode.")
+    commanded = _checked(path, "commanded", commanded, (steps + 1, STATE_DIM))
+    endpose = _checked(path, "endpose", endpose, (steps + 1, 2, 7))
+    ours = {
+        "expert_action": _checked(path, "expert_action", expert_action, (steps, ACTION_DIM)).astype(np.float32),
+        "measured": _checked(path, "measured", measured, (steps + 1, STATE_DIM)).astype(np.float32),
+        "contacts": _checked(path, "contacts", contacts, (steps + 1, 2)).astype(bool),
+        "slack": _checked(path, "slack", slack, (steps,)).astype(np.float32),
+    }
+    if len(phase) != steps:
+        raise DataError(f"{path}:phase", f"{steps} names", len(phase), "Give one phase per step.")
+    jpegs = _encoded(path, images, steps + 1)
+    parameters = _camera_arrays(path, camera_parameters, steps + 1)
+
+    def fill(file: h5py.File) -> None:
+        file.attrs["ugr_format_version"] = FORMAT_VERSION
+        file.attrs["package_version"] = version("ugr-lightning")
+        file.attrs["task"], file.attrs["setting"] = task, setting
+        file.attrs["seed"], file.attrs["control_hz"] = int(seed), float(control_hz)
+        file.attrs["noise"] = json.dumps(dict(noise or {}), sort_keys=True)
+        _write_robot(file, commanded, endpose)
+        for camera, disk in DISK_CAMERAS.items():
+            group = file.create_group(f"observation/{disk}")
+            group["rgb"] = np.array(jpegs[camera], dtype=bytes)  # (N + 1,) S{longest}, padded with NUL
+            for name, values in parameters[camera].items():
+                group[name] = values
+        file["pointcloud"] = np.zeros((steps + 1, 0))
+        for key, array in ours.items():
+            file[f"ugr/{key}"] = array
+        file["ugr/phase"] = np.array([name.encode() for name in phase])
+
+    def write(partial: Path) -> None:
+        with h5py.File(partial, "w") as file:
+            fill(file)
+
+    publish(path, write)
+
+
+def _write_robot(file: h5py.File, commanded: np.ndarray, endpose: np.ndarray) -> None:
+    """`joint_action/*` and `endpose/*`, all float64."""
+    for side, start, pose in (("left", 0, 0), ("right", 7, 1)):
+        file[f"joint_action/{side}_arm"] = commanded[:, start : start + 6]
+        file[f"joint_action/{side}_gripper"] = commanded[:, start + 6]
+        file[f"endpose/{side}_endpose"] = endpose[:, pose]
+        file[f"endpose/{side}_gripper"] = commanded[:, start + 6]
+    file["joint_action/vector"] = commanded
+
+
+def _checked(path: Path, key: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    array = np.asarray(values, dtype=np.float64)
+    if array.shape != shape:
+        raise DataError(f"{path}:{key}", f"shape {shape}", array.shape, "Nothing was written.")
+    if not np.isfinite(array).all():
+        first = np.argwhere(~np.isfinite(array))[0].tolist()
+        raise DataError(f"{path}:{key}", "finite numbers", f"{array[tuple(first)]} at {first}", "Nothing was written.")
+    return array
+
+
+def _encoded(path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames: int) -> dict[str, list[bytes]]:
+    """JPEG bytes by camera, one per frame."""
+    wanted = f"{frames} frames of {len(CAMERAS)} uint8 pictures (H, W, 3) or JPEGs"
+    if len(images) != frames or any(len(frame) != len(CAMERAS) for frame in images):
+        raise DataError(f"{path}:images", wanted, f"{len(images)} frames", "Nothing was written.")
+    if isinstance(images, np.ndarray):
+        if images.dtype != np.uint8 or images.ndim != 5 or images.shape[-1] != 3:
+            raise DataError(f"{path}:images", wanted, f"{images.shape} {images.dtype}", "Nothing was written.")
+        images = [encode_frame(frame) for frame in images]
+    return {camera: [bytes(frame[v]) for frame in images] for v, camera in enumerate(CAMERAS)}
+
+
+def _camera_arrays(
+    path: Path, parameters: CameraParameters | Sequence[CameraParameters], frames: int
+) -> dict[str, dict[str, np.ndarray]]:
+    """By camera and name, an array with one matrix per frame."""
+    rows = [parameters] * frames if isinstance(parameters, Mapping) else list(parameters)
+    if len(rows) != frames:
+        raise DataError(f"{path}:camera_parameters", f"{frames} items", len(rows), "Nothing was written.")
+    arrays: dict[str, dict[str, np.ndarray]] = {}
+    for camera in CAMERAS:
+        arrays[camera] = {}
+        for name, shape in CAMERA_PARAMETERS.items():
+            try:
+                values = np.stack([np.asarray(row[camera][name]) for row in rows])
+            except KeyError as error:
+                got = f"no {error}"
+                raise DataError(f"{path}:{camera}", f"'{name}'", got, "Nothing was written.") from error
+            arrays[camera][name] = _checked(path, f"{camera}/{name}", values, (frames, *shape)).astype(np.float32)
+    return arrays
+
+
+def read_episode(path: Path, cameras: Sequence[str] = CAMERAS, *, seed: int | None = None) -> Episode:
+    """Check one episode file completely and return it with its frames still on disk.
+
+    Args:
+        path: a RoboTwin 2.0 raw file, ours or RoboTwin's own.
+        cameras: names of `contract.CAMERAS`, in the order wanted.
+        seed: simulator seed known from `seed.txt`, used where the file does not say.
+
+    Returns:
+        T = frames - 1 steps: state[t] = vector[t], action[t] = `ugr/expert_action[t]` or, without it, vector[t + 1].
+
+    Raises:
+        DataError: anything missing, damaged, foreign, or of another shape, type or length.
+        ConfigError: a camera that does not exist.
+
+    Source: FACTS 1.1, 1.4; headline 6.
+    """
+    path = Path(path)
+    unknown = [camera for camera in cameras if camera not in DISK_CAMERAS]
+    if unknown or not cameras:
+        known = ", ".join(DISK_CAMERAS)
+        raise ConfigError("data.cameras", f"names among {known}", ", ".join(unknown) or "none", "Correct the name.")
+    with open_hdf5(path) as file:
+        vector = read_array(file, "joint_action/vector", (None, STATE_DIM))
+        frames = len(vector)
+        if frames < 2:
+            raise DataError(f"{path}:joint_action/vector", "at least 2 frames", frames, FIX)
+        state, action, measured = vector[:-1], vector[1:], None
+        if has_key(file, "ugr/expert_action"):
+            action = read_array(file, "ugr/expert_action", (frames - 1, ACTION_DIM))
+        if has_key(file, "ugr/measured"):
+            measured = read_array(file, "ugr/measured", (frames, STATE_DIM))[:-1]
+        keys = tuple(f"observation/{DISK_CAMERAS[camera]}/rgb" for camera in cameras)
+        sizes = [_check_jpegs(file, key, frames) for key in keys]
+        if len(set(sizes)) > 1:
+            raise DataError(f"{path}:observation", "cameras of one size", sizes, "Choose cameras of one size.")
+        extras = _read_extras(file, frames)
+    return Episode(
+        path=path,
+        cameras=tuple(cameras),
+        state=np.ascontiguousarray(state),
+        action=np.ascontiguousarray(action),
+        frames=JpegFrames(path, keys, sizes[0]),
+        measured=measured,
+        seed=extras.pop("seed", seed),
+        extras=extras,
+    )
+
+
+def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
+    """Check every frame of a camera by its header and end marker; return their common (height, width)."""
+    found, where = find_dataset(file, key), f"{file.filename}:{key}"
+    if found.shape != (frames,):
+        raise DataError(where, f"shape ({frames},) as joint_action/vector has", found.shape, FIX)
+    if found.dtype.kind != "S":
+        raise DataError(where, "JPEG bytes (dtype S)", found.dtype, FIX)
+    sizes: list[tuple[int, int]] = []
+    for step in range(frames):  # one row at a time: what a file declares in total is never allocated
+        try:
+            sizes.append(jpeg_size(bytes(found[step])))
+        except ValueError as error:
+            raise DataError(f"{where}[{step}]", "a JPEG", str(error), FIX) from error
+        if sizes[step] != sizes[0]:
+            raise DataError(f"{where}[{step}]", f"a picture of {sizes[0]}", sizes[step], FIX)
+    if max(sizes[0]) > MAX_PIXELS:
+        raise DataError(where, f"pictures of at most {MAX_PIXELS} pixels a side", sizes[0], FIX)
+    return sizes[0]
+
+
+def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
+    """What our files say beyond RoboTwin's layout; empty for RoboTwin's own."""
+    extras: dict[str, Any] = {}
+    if has_key(file, "ugr/contacts"):
+        extras["contacts"] = read_array(file, "ugr/contacts", (frames, 2), kind="b")
+    if has_key(file, "ugr/slack"):
+        extras["slack"] = read_array(file, "ugr/slack", (frames - 1,))
+    if has_key(file, "ugr/phase"):
+        extras["phase"] = read_strings(file, "ugr/phase", frames - 1)
+    written = file.attrs.get("ugr_format_version", FORMAT_VERSION)
+    if written != FORMAT_VERSION:
+        got = f"version {written}"
+        raise DataError(file.filename, f"format version {FORMAT_VERSION}", got, "Update ugr-lightning.")
+    kinds: dict[str, type] = {"seed": int, "control_hz": float, "task": str, "setting": str, "noise": str}
+    for name, kind in kinds.items():
+        if name not in file.attrs:
+            continue
+        try:
+            extras[name] = kind(file.attrs[name])
+        except (TypeError, ValueError) as error:
+            raise DataError(f"{file.filename}:@{name}", kind.__name__, file.attrs[name], FIX) from error
+    return extras
