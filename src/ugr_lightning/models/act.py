@@ -1,0 +1,370 @@
+"""ACT, the Action Chunking Transformer, with the uncertainty-guided sparse refinement of the paper."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal, NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from ugr_lightning.contract import (
+    ACTION_DIM,
+    CAMERAS,
+    CHUNK_LENGTH,
+    STATE_DIM,
+    Batch,
+    Chunk,
+    ChunkPolicy,
+    Observation,
+    Statistics,
+)
+from ugr_lightning.errors import ConfigError, NumericsError
+from ugr_lightning.models.augmentation import jitter_colour, shift_images
+from ugr_lightning.models.cvae import Posterior
+from ugr_lightning.models.losses import (
+    Reconstruction,
+    coarse_loss,
+    kl_loss,
+    refine_loss,
+    total_loss,
+    uncertainty_loss,
+)
+from ugr_lightning.models.normalizer import Normalizer
+from ugr_lightning.models.precision import Precision, autocast
+from ugr_lightning.models.refine.branch import BranchName, ResidualBranch
+from ugr_lightning.models.refine.selector import Selector
+from ugr_lightning.models.transformer import DecoderLayer, EncoderLayer, sine_positions_2d
+from ugr_lightning.models.vision import NormName, ResNet18, StemName
+
+
+class Plan(NamedTuple):
+    """A chunk in normalised units, with what was needed to make it.
+
+    Args:
+        actions: (B, K, A) float32, A_1, or A_0 where nothing refines.
+        coarse: (B, K, A) float32, A_0.
+        log_variance: (B, K) float32, s; None without an uncertainty head.
+        refined: (B, K) bool, m; None where nothing refines.
+    """
+
+    actions: Tensor
+    coarse: Tensor
+    log_variance: Tensor | None
+    refined: Tensor | None
+
+
+class ACT(ChunkPolicy):
+    """Predicts a chunk of actions from images and joints, and refines some of its steps.
+
+    The defaults are the sizes of the paper. `configs/` holds smaller ones.
+
+    Args:
+        refine: which steps are refined: Full, Block, Uncertainty, a selector of your own, or null for none (`base`).
+        refine_branch: what computes the correction: `mlp` per step, or one more `decoder` layer.
+        refine_detach_coarse: keep the refinement loss from changing the coarse actions; the paper lets it.
+        uncertainty_head: predict a log-variance per step even where `refine` does not ask for it, for analysis.
+        causal: let a step attend only to earlier ones in the decoder's self-attention (`cmask`).
+        decoder_readout: which decoder layer is read out: `last`, or `first` as the public ACT code does (then the
+            other layers are not built).
+        reconstruction: `mse`, summed over the action (paper), or `l1`, averaged over it (public ACT code).
+        kl_weight: lambda_KL.
+        uncertainty_weight: lambda_u.
+        cameras: names of the cameras, in the order of the images.
+        chunk_length: K, steps predicted at once.
+        state_dim: S, numbers in the state.
+        action_dim: A, numbers in an action.
+        dim: D, width of the transformer.
+        feedforward: width of its feed-forward nets.
+        heads: attention heads.
+        encoder_layers: layers that mix latent, state and image tokens.
+        decoder_layers: layers that turn them into a chunk.
+        cvae_layers: layers of the CVAE encoder; 0 builds none, and the latent is always zero.
+        latent_dim: numbers in the latent.
+        dropout: in all transformer layers.
+        backbone_width: channels of the first stage of the ResNet-18; 64 is the usual one.
+        backbone_stride: pixels a token stands for, 32 or 16.
+        backbone_stem: `standard`, or `unshuffle`, which is cheaper and has no published weights.
+        backbone_norm: `frozen` (needs `backbone_weights`), `batch` (for training from scratch) or `group`.
+        backbone_weights: file with ResNet-18 weights to start from: torchvision, original ACT or lerobot key names.
+        camera_embedding: give each camera a learned position of its own, so that the policy can tell them apart.
+        position_in_values: add positions to the image tokens themselves, not to queries and keys alone.
+        keypoints: number of spatial-softmax keypoints a camera, given as one more token each; 0 for none.
+        state_dropout: probability, per sample, of hiding the state in training; 1 hides it at run time as well.
+        state_noise: standard deviation of noise on the state in training, in normalised units.
+        image_shift: largest random displacement of the images in training, in pixels.
+        color_jitter: largest random relative change of contrast and brightness in training.
+        precision: arithmetic of the trunk: `auto` takes bf16 where the hardware has it, else fp32.
+
+    Source: PAPER, method; FACTS 3; DESIGN 4.
+    """
+
+    def __init__(
+        self,
+        refine: Selector | None = None,
+        refine_branch: BranchName = "mlp",
+        refine_detach_coarse: bool = False,
+        uncertainty_head: bool = False,
+        causal: bool = False,
+        decoder_readout: Literal["last", "first"] = "last",
+        reconstruction: Reconstruction = "mse",
+        kl_weight: float = 10.0,
+        uncertainty_weight: float = 1.0,
+        cameras: Sequence[str] = CAMERAS,
+        chunk_length: int = CHUNK_LENGTH,
+        state_dim: int = STATE_DIM,
+        action_dim: int = ACTION_DIM,
+        dim: int = 512,
+        feedforward: int = 3200,
+        heads: int = 8,
+        encoder_layers: int = 4,
+        decoder_layers: int = 7,
+        cvae_layers: int = 4,
+        latent_dim: int = 32,
+        dropout: float = 0.1,
+        backbone_width: int = 64,
+        backbone_stride: Literal[16, 32] = 32,
+        backbone_stem: StemName = "standard",
+        backbone_norm: NormName = "frozen",
+        backbone_weights: str | None = None,
+        camera_embedding: bool = False,
+        position_in_values: bool = False,
+        keypoints: int = 0,
+        state_dropout: float = 0.0,
+        state_noise: float = 0.0,
+        image_shift: int = 0,
+        color_jitter: float = 0.0,
+        precision: Precision = "auto",
+    ) -> None:
+        super().__init__()
+        if dim % heads or dim % 4:
+            raise ConfigError("dim", f"a multiple of heads ({heads}) and of 4", dim, "Change `dim` or `heads`.")
+        self.cameras, self.chunk_length = tuple(cameras), chunk_length
+        self.state_dim, self.action_dim, self.latent_dim = state_dim, action_dim, latent_dim
+        self.refine, self.refine_detach_coarse, self.causal = refine, refine_detach_coarse, causal
+        self.reconstruction, self.kl_weight, self.uncertainty_weight = reconstruction, kl_weight, uncertainty_weight
+        self.state_dropout, self.state_noise = state_dropout, state_noise
+        self.image_shift, self.color_jitter = image_shift, color_jitter
+        self.position_in_values, self.precision = position_in_values, precision
+        sizes = (dim, heads, feedforward, dropout)
+
+        self.normalizer = Normalizer(state_dim, action_dim)
+        self.posterior = Posterior(cvae_layers, latent_dim, state_dim, action_dim, *sizes) if cvae_layers else None
+
+        self.backbone = ResNet18(backbone_width, backbone_stride, backbone_stem, backbone_norm)
+        self.input_proj = nn.Conv2d(self.backbone.channels, dim, 1)
+        self.camera_embed = nn.Parameter(0.02 * torch.randn(len(self.cameras), dim)) if camera_embedding else None
+        self.keypoint_maps = nn.Conv2d(self.backbone.middle_channels, keypoints, 1) if keypoints else None
+        self.keypoint_proj = nn.Linear(2 * keypoints, dim) if keypoints else None
+        self.keypoint_embed = nn.Parameter(torch.randn(len(self.cameras), dim)) if keypoints else None
+        self.latent_out_proj = nn.Linear(latent_dim, dim)
+        self.state_proj = nn.Linear(state_dim, dim)
+        self.additional_pos_embed = nn.Parameter(torch.randn(2, dim))  # of the latent and the state token
+
+        built = 1 if decoder_readout == "first" else decoder_layers  # layers behind the readout would be dead
+        self.encoder = nn.ModuleList(EncoderLayer(*sizes) for _ in range(encoder_layers))
+        self.decoder = nn.ModuleList(DecoderLayer(*sizes) for _ in range(built))
+        self.decoder_norm = nn.LayerNorm(dim)
+        self.query_embed = nn.Parameter(torch.randn(chunk_length, dim))
+        for parameter in (*self.encoder.parameters(), *self.decoder.parameters()):
+            if parameter.dim() > 1:
+                nn.init.xavier_uniform_(parameter)
+
+        self.action_head = nn.Linear(dim, action_dim)
+        wants_uncertainty = uncertainty_head or (refine is not None and refine.needs_uncertainty)
+        self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
+        self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
+        self.budget = refine.budget(chunk_length) if refine is not None else None
+        if backbone_weights is not None:
+            self.backbone.load_weights(backbone_weights)
+
+    def blueprint(self) -> dict[str, Any]:
+        """The class and its arguments, without `backbone_weights`: a checkpoint holds the trained ones instead."""
+        recorded = super().blueprint()
+        return {**recorded, "init_args": {**recorded["init_args"], "backbone_weights": None}}
+
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Store the normalisation statistics in the policy's buffers."""
+        self.normalizer.fit(statistics)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The terms of the paper's objective.
+
+        The latent is sampled from the posterior in training; in evaluation it is the posterior's mean, so that
+        validation has no randomness.
+
+        Args:
+            batch: observations and the chunks that followed.
+
+        Returns:
+            Scalars `loss`, `coarse`, and where the policy has them `refine`, `uncertainty`, `kl`.
+
+        Raises:
+            ConfigError: images of another number of cameras.
+            CheckpointError: no normalisation statistics.
+        """
+        state = self._disturb_state(self.normalizer.state(batch.state))  # (B, S)
+        target = self.normalizer.action(batch.actions)  # (B, K, A)
+        latent, posterior = self._encode_chunk(state, target, batch.valid)
+        plan = self._plan(batch.images, state, latent, batch.valid)
+        terms = {"coarse": coarse_loss(plan.coarse, target, batch.valid, self.reconstruction)}
+        if plan.refined is not None:
+            terms["refine"] = refine_loss(plan.actions, target, plan.refined, batch.valid, self.reconstruction)
+        if plan.log_variance is not None:
+            terms["uncertainty"] = uncertainty_loss(plan.coarse, target, plan.log_variance, batch.valid)
+        if posterior is not None:
+            terms["kl"] = kl_loss(*posterior)
+        total = total_loss(terms, uncertainty_weight=self.uncertainty_weight, kl_weight=self.kl_weight)
+        return {"loss": total, **terms}
+
+    @torch.no_grad()
+    def predict(self, observation: Observation) -> Chunk:
+        """The chunk to execute, with a latent of zero, in evaluation mode whatever mode the policy is in.
+
+        Args:
+            observation: what the robot sees now.
+
+        Returns:
+            The chunk, in robot units.
+
+        Raises:
+            NumericsError: a NaN or an infinity in the state or in the prediction.
+            ConfigError: images of another number of cameras.
+            CheckpointError: no normalisation statistics.
+        """
+        if not observation.state.isfinite().all():
+            fix = "Look at the robot's or the simulator's joint readings."
+            raise NumericsError("observation.state", "finite numbers", "a NaN or an infinity", fix)
+        with self._evaluation_mode():
+            state = self._disturb_state(self.normalizer.state(observation.state))  # (B, S)
+            latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
+            whole = torch.ones(state.shape[0], self.chunk_length, dtype=torch.bool, device=state.device)
+            plan = self._plan(observation.images, state, latent, whole)
+            actions = self.normalizer.robot_action(plan.actions)  # (B, K, A)
+            if not actions.isfinite().all():
+                fix = "Training diverged or the file is damaged: use an earlier checkpoint, a lower learning rate."
+                raise NumericsError("predicted actions", "finite numbers", "a NaN or an infinity", fix)
+            coarse = actions if plan.refined is None else self.normalizer.robot_action(plan.coarse)
+        if plan.refined is None:
+            return Chunk(actions, log_variance=plan.log_variance)
+        return Chunk(actions, coarse, plan.log_variance, plan.refined)
+
+    def _plan(self, images: Tensor, state: Tensor, latent: Tensor, valid: Tensor) -> Plan:
+        """From inputs in network units to a chunk in network units; the paper's method in order."""
+        with autocast(self.precision, state.device):
+            memory, memory_position = self._encode(images, state, latent)  # (B, N, D), (N, D)
+            memory_keys = memory + memory_position  # (B, N, D)
+            hidden = self._decode(memory, memory_keys)  # (B, K, D), H_0
+        exact = hidden.float()
+        coarse = self.action_head(exact)  # (B, K, A), A_0
+        log_variance = None
+        if self.uncertainty_head is not None:
+            log_variance = self.uncertainty_head(exact.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
+        if self.refine is None or self.branch is None:
+            return Plan(coarse, coarse, log_variance, None)
+        hint = None if log_variance is None else log_variance.detach()
+        refined = self.refine.select(hint, valid, self.training)  # (B, K), m
+        start = coarse.detach() if self.refine_detach_coarse else coarse
+        with autocast(self.precision, state.device):
+            if self.branch.stepwise and self.budget is not None and not torch.is_grad_enabled():
+                residual = self.branch.at(refined, self.budget, hidden, start)  # (B, K, A), m * dA
+            else:
+                residual = self.branch(hidden, start, self.query_embed, memory, memory_keys)  # (B, K, A), dA
+        return Plan(start + refined[..., None] * residual, coarse, log_variance, refined)  # A_1 = A_0 + m * dA
+
+    def _encode_chunk(
+        self, state: Tensor, actions: Tensor, valid: Tensor
+    ) -> tuple[Tensor, tuple[Tensor, Tensor] | None]:
+        """The latent of a demonstrated chunk, (B, latent), and mean and log-variance of its posterior."""
+        if self.posterior is None:
+            return state.new_zeros(state.shape[0], self.latent_dim), None
+        with autocast(self.precision, state.device):
+            mean, log_variance = self.posterior(state, actions, valid)  # (B, latent) each
+        if not self.training:
+            return mean, (mean, log_variance)
+        return mean + (log_variance / 2).exp() * torch.randn_like(mean), (mean, log_variance)
+
+    def _encode(self, images: Tensor, state: Tensor, latent: Tensor) -> tuple[Tensor, Tensor]:
+        """Memory (B, N, D) and its positions (N, D), in the order [latent, state, keypoints, image tokens]."""
+        tokens, position, middle = self._image_tokens(images)  # (B, V P, D), (V P, D), (B V, C, h, w)
+        front = [self.latent_out_proj(latent)[:, None], self.state_proj(state)[:, None]]  # (B, 1, D) each
+        front_position = [self.additional_pos_embed]  # (2, D)
+        if self.keypoint_maps is not None and self.keypoint_proj is not None and self.keypoint_embed is not None:
+            points = spatial_softmax(self.keypoint_maps(middle))  # (B V, 2 keypoints)
+            front.append(self.keypoint_proj(points).unflatten(0, (-1, len(self.cameras))))  # (B, V, D)
+            front_position.append(self.keypoint_embed)  # (V, D)
+        x = torch.cat([*front, tokens.to(front[0].dtype)], dim=1)  # (B, N, D)
+        position = torch.cat([*front_position, position]).to(x.dtype)  # (N, D)
+        for layer in self.encoder:
+            x = layer(x, position)
+        return x, position
+
+    def _image_tokens(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Tokens of all cameras (B, V P, D), their positions (V P, D), and the features (B V, C, h, w) of stage 3."""
+        cameras = len(self.cameras)
+        if images.dim() != 5 or images.shape[1:3] != (cameras, 3) or images.dtype != torch.uint8:
+            expected = f"(B, {cameras}, 3, H, W) uint8 for cameras {', '.join(self.cameras)}"
+            fix = "Give the policy the cameras it was built for, in that order."
+            raise ConfigError("observation.images", expected, f"{tuple(images.shape)} {images.dtype}", fix)
+        pixels = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # (B V, 3, H, W)
+        if self.training and self.image_shift:
+            pixels = shift_images(pixels, self.image_shift)
+        pixels = self.backbone.normalise(pixels)
+        if self.training and self.color_jitter:
+            pixels = jitter_colour(pixels, self.color_jitter, cameras)
+        middle, last = self.backbone(pixels)
+        features = self.input_proj(last)  # (B V, D, h, w)
+        height, width = features.shape[2:]
+        position = sine_positions_2d(height, width, features.shape[1]).to(features.device)  # (P, D)
+        position = position.expand(cameras, -1, -1)  # (V, P, D)
+        if self.camera_embed is not None:
+            position = position + self.camera_embed[:, None]
+        position = position.flatten(0, 1)  # (V P, D)
+        tokens = features.flatten(2).transpose(1, 2)  # (B V, P, D)
+        tokens = tokens.unflatten(0, (-1, cameras)).flatten(1, 2)  # (B, V P, D)
+        if self.position_in_values:
+            tokens = tokens + position.to(tokens.dtype)
+        return tokens, position, middle
+
+    def _decode(self, memory: Tensor, memory_keys: Tensor) -> Tensor:
+        """Coarse hidden states (B, K, D), H_0."""
+        x = memory.new_zeros(memory.shape[0], *self.query_embed.shape)  # (B, K, D)
+        position = self.query_embed.to(x.dtype)  # (K, D)
+        steps = self.chunk_length
+        allowed = torch.ones(steps, steps, dtype=torch.bool, device=x.device).tril() if self.causal else None  # (K, K)
+        for layer in self.decoder:
+            x = layer(x, position, memory, memory_keys, allowed)
+        normed: Tensor = self.decoder_norm(x)
+        return normed
+
+    def _disturb_state(self, state: Tensor) -> Tensor:
+        """Noise on the state and hiding it, (B, S), normalised; a hidden state is the mean state."""
+        if self.training and self.state_noise:
+            state = state + self.state_noise * torch.randn_like(state)
+        if self.state_dropout >= 1:
+            return torch.zeros_like(state)
+        if self.training and self.state_dropout:
+            state = state * (torch.rand(state.shape[0], 1, device=state.device) >= self.state_dropout)
+        return state
+
+    @contextmanager
+    def _evaluation_mode(self) -> Iterator[None]:
+        was_training = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(was_training)
+
+
+def spatial_softmax(maps: Tensor) -> Tensor:
+    """Where each map is high: the mean position under its softmax.
+
+    Args:
+        maps: (n, keypoints, h, w).
+
+    Returns:
+        (n, 2 keypoints) float32, x then y of each, -1 .. 1 over the image.
+    """
+    weights = maps.float().flatten(2).softmax(-1).unflatten(2, maps.shape[2:])  # (n, keypoints, h, w)
+    y, x = (torch.linspace(-1, 1, n, device=maps.device) for n in maps.shape[2:])
+    return torch.stack([weights.sum(2) @ x, weights.sum(3) @ y], dim=-1).flatten(1)  # (n, 2 keypoints)

@@ -1,0 +1,20 @@
+"""Full refinement: every step."""
+
+from torch import Tensor
+
+from ugr_lightning.models.refine.selector import Selector
+
+
+class Full(Selector):
+    """Refines every step, m = 1."""
+
+    def __init__(self) -> None:
+        super().__init__()
+
+    def budget(self, chunk_length: int) -> int:
+        """All K."""
+        return chunk_length
+
+    def select(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
+        """See `Selector.select`."""
+        return valid.clone()  # (B, K)

@@ -1,0 +1,154 @@
+"""Post-norm transformer layers of DETR and ACT: torch's key names, positions added to queries and keys."""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+
+class Attention(nn.Module):
+    """Multi-head attention; parameters are named and shaped as in `torch.nn.MultiheadAttention`.
+
+    Args:
+        dim: D.
+        heads: number of heads; must divide `dim`.
+        dropout: on the attention weights.
+    """
+
+    def __init__(self, dim: int, heads: int, dropout: float) -> None:
+        super().__init__()
+        self.heads, self.dropout = heads, dropout
+        self.in_proj_weight = nn.Parameter(torch.empty(3 * dim, dim))
+        self.in_proj_bias = nn.Parameter(torch.zeros(3 * dim))
+        self.out_proj = nn.Linear(dim, dim)
+        nn.init.xavier_uniform_(self.in_proj_weight)
+        nn.init.zeros_(self.out_proj.bias)
+
+    def forward(self, query: Tensor, key: Tensor, value: Tensor, allowed: Tensor | None = None) -> Tensor:
+        """Attend.
+
+        Args:
+            query: (B, Q, D), positions added.
+            key: (B, N, D), positions added; the same object as `query` in self-attention.
+            value: (B, N, D).
+            allowed: bool, broadcastable to (B, heads, Q, N); False where a query may not look.
+
+        Returns:
+            (B, Q, D).
+        """
+        dim = query.shape[-1]
+        weight, bias = self.in_proj_weight, self.in_proj_bias
+        if query is key:
+            q, k = functional.linear(query, weight[: 2 * dim], bias[: 2 * dim]).chunk(2, dim=-1)  # (B, Q, D) twice
+        else:
+            q = functional.linear(query, weight[:dim], bias[:dim])  # (B, Q, D)
+            k = functional.linear(key, weight[dim : 2 * dim], bias[dim : 2 * dim])  # (B, N, D)
+        v = functional.linear(value, weight[2 * dim :], bias[2 * dim :])  # (B, N, D)
+        q, k, v = (x.unflatten(-1, (self.heads, -1)).transpose(1, 2) for x in (q, k, v))  # (B, heads, Q or N, D/heads)
+        mixed = attend(q, k, v, allowed, self.dropout if self.training else 0.0)  # (B, heads, Q, D/heads)
+        projected: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))  # (B, Q, D)
+        return projected
+
+
+def attend(q: Tensor, k: Tensor, v: Tensor, allowed: Tensor | None, dropout: float) -> Tensor:
+    """Softmax attention of (B, heads, Q, d) queries over (B, heads, N, d) keys and values."""
+    scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, heads, Q, N)
+    if allowed is not None:
+        scores = scores.masked_fill(~allowed, -torch.inf)
+    weights = functional.dropout(scores.softmax(-1), dropout)
+    return weights @ v
+
+
+class EncoderLayer(nn.Module):
+    """Self-attention and a feed-forward net, each added to its input and then normalised.
+
+    Args:
+        dim, heads, feedforward, dropout: as in `torch.nn.TransformerEncoderLayer`.
+
+    Source: FACTS 3.3.
+    """
+
+    def __init__(self, dim: int, heads: int, feedforward: int, dropout: float) -> None:
+        super().__init__()
+        self.self_attn = Attention(dim, heads, dropout)
+        self.linear1, self.linear2 = nn.Linear(dim, feedforward), nn.Linear(feedforward, dim)
+        self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(self, x: Tensor, position: Tensor, allowed: Tensor | None = None) -> Tensor:
+        """(B, N, D) to (B, N, D); `position` is (N, D), `allowed` as in `Attention`."""
+        queries = x + position
+        x = self.norm1(x + self.dropout(self.self_attn(queries, queries, x, allowed)))
+        return self.norm2(x + self.dropout(self.linear2(self.dropout(functional.relu(self.linear1(x))))))
+
+
+class DecoderLayer(nn.Module):
+    """Self-attention, cross-attention to a memory and a feed-forward net, each added and then normalised.
+
+    Args:
+        dim, heads, feedforward, dropout: as in `torch.nn.TransformerDecoderLayer`.
+
+    Source: FACTS 3.4.
+    """
+
+    def __init__(self, dim: int, heads: int, feedforward: int, dropout: float) -> None:
+        super().__init__()
+        self.self_attn = Attention(dim, heads, dropout)
+        self.multihead_attn = Attention(dim, heads, dropout)
+        self.linear1, self.linear2 = nn.Linear(dim, feedforward), nn.Linear(feedforward, dim)
+        self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(dim) for _ in range(3))
+        self.dropout = nn.Dropout(dropout)
+
+    def forward(
+        self, x: Tensor, position: Tensor, memory: Tensor, memory_keys: Tensor, allowed: Tensor | None = None
+    ) -> Tensor:
+        """Decode.
+
+        Args:
+            x: (B, K, D).
+            position: (K, D) or (B, K, D), added to queries and keys.
+            memory: (B, N, D).
+            memory_keys: (B, N, D) memory with its positions added.
+            allowed: (K, K) bool, False where a step may not look at another; None for all.
+
+        Returns:
+            (B, K, D).
+        """
+        queries = x + position
+        x = self.norm1(x + self.dropout(self.self_attn(queries, queries, x, allowed)))
+        x = self.norm2(x + self.dropout(self.multihead_attn(x + position, memory_keys, memory)))
+        return self.norm3(x + self.dropout(self.linear2(self.dropout(functional.relu(self.linear1(x))))))
+
+
+def sine_positions(steps: int, dim: int) -> Tensor:
+    """The sinusoid table of a sequence: sin on even, cos on odd dimensions.
+
+    Returns:
+        (steps, dim) float32.
+
+    Source: FACTS 3.1.
+    """
+    return _interleave(torch.arange(steps, dtype=torch.float64), dim).float()
+
+
+def sine_positions_2d(height: int, width: int, dim: int) -> Tensor:
+    """The sinusoid table of a feature map: half of the dimensions for y, half for x, each counted to 2 pi.
+
+    Returns:
+        (height * width, dim) float32, row by row.
+
+    Source: FACTS 3.2.
+    """
+    y, x = (
+        _interleave(torch.arange(1, n + 1, dtype=torch.float64) / (n + 1e-6) * 2 * math.pi, dim // 2)
+        for n in (height, width)
+    )
+    table = torch.cat([y[:, None].expand(-1, width, -1), x[None].expand(height, -1, -1)], dim=-1)  # (h, w, D)
+    return table.flatten(0, 1).float()
+
+
+def _interleave(values: Tensor, dim: int) -> Tensor:
+    frequency = 10000 ** (-2 * (torch.arange(dim, dtype=torch.float64) // 2) / dim)  # (dim,)
+    angle = values[:, None] * frequency  # (n, dim)
+    return torch.where(torch.arange(dim) % 2 == 0, angle.sin(), angle.cos())
