@@ -1,0 +1,71 @@
+"""The tasks: one file each, found by listing this folder. Nothing here imports SAPIEN until a task is loaded."""
+
+import ast
+import difflib
+import importlib
+from pathlib import Path
+from typing import Any
+
+from ugr_lightning.errors import ConfigError, SimulationError
+
+
+def task_names() -> tuple[str, ...]:
+    """Names of all tasks, sorted."""
+    return tuple(sorted(path.stem for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")))
+
+
+def task_summaries() -> dict[str, str]:
+    """One line on each task, the first of its file."""
+    folder = Path(__file__).parent
+    summaries = {}
+    for name in task_names():
+        text = ast.get_docstring(ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))) or ""
+        summaries[name] = text.split("\n", 1)[0]
+    return summaries
+
+
+def check_task(name: str) -> None:
+    """Make sure that a task exists, without loading it.
+
+    Raises:
+        ConfigError: there is no such task; the message names the closest ones.
+    """
+    names = task_names()
+    if name not in names:
+        close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
+        fix = f"Did you mean {' or '.join(close)}?" if close else "`ugr tasks` lists them."
+        raise ConfigError("task", "one of " + ", ".join(names), repr(name), fix)
+
+
+def environment_id(name: str) -> str:
+    """The task's gymnasium id, e.g. `UGR-ClickAlarmclock-v1`."""
+    return f"UGR-{''.join(part.capitalize() for part in name.split('_'))}-v1"
+
+
+def load_task(name: str) -> type[Any]:
+    """The environment class of a task, registered with gymnasium; imports SAPIEN.
+
+    Args:
+        name: a name from `task_names`.
+
+    Raises:
+        ConfigError: there is no such task.
+        SimulationError: SAPIEN or ManiSkill is not installed, or the file defines no task.
+    """
+    check_task(name)
+    try:
+        from mani_skill.utils.registration import REGISTERED_ENVS, register_env
+
+        from ugr_lightning.sim.scene import TwoArmEnv
+
+        module = importlib.import_module(f"{__name__}.{name}")
+    except ModuleNotFoundError as error:
+        fix = "Install the simulator: `pip install sapien mani-skill`. Training works without it."
+        raise SimulationError(f"task {name}", "an installed simulator", f"no module {error.name}", fix) from error
+    classes = [item for item in vars(module).values() if isinstance(item, type) and item.__module__ == module.__name__]
+    tasks = [item for item in classes if issubclass(item, TwoArmEnv)]
+    if len(tasks) != 1:
+        raise SimulationError(module.__name__, "one subclass of TwoArmEnv", len(tasks), "Define exactly one per file.")
+    if environment_id(name) not in REGISTERED_ENVS:
+        register_env(environment_id(name), max_episode_steps=tasks[0].horizon)(tasks[0])
+    return tasks[0]

@@ -1,0 +1,228 @@
+"""The table with two arms, lights and three cameras, as a ManiSkill environment; a task adds its props and its rules."""
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+import sapien
+import torch
+from mani_skill.envs.sapien_env import BaseEnv
+from mani_skill.sensors.camera import CameraConfig
+from mani_skill.utils.structs.types import SceneConfig, SimConfig
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.sim.expert import Arms, ExpertStep
+from ugr_lightning.sim.kinematics import SIDES, Array
+from ugr_lightning.sim.objects import Colour, Prop, pose_of
+from ugr_lightning.sim.robot import ACTION_HIGH, ACTION_LOW, HOME_ACTION, UID
+
+SIMULATION_HZ, CONTROL_HZ = 250, 25
+SETTLE_SECONDS = 0.1  # inside reset, never recorded
+TOUCH_IMPULSE = 1e-6  # N s; pairs that are only close to each other are listed by PhysX with no impulse
+
+
+class Appearance(NamedTuple):
+    """What the surroundings look like in one episode."""
+
+    table: Colour
+    wall: Colour
+    floor: Colour
+    ambient: float
+    key_light: float
+    fill_light: float
+
+
+class Touch(NamedTuple):
+    """A contact between a finger and something that is not the robot.
+
+    Args:
+        side: arm of the finger.
+        other: name of the prop.
+        points: (n, 3) contact points in the world, metres.
+    """
+
+    side: str
+    other: str
+    points: Array
+
+
+def _clean(rng: np.random.Generator) -> Appearance:
+    return Appearance((0.66, 0.57, 0.47), (0.78, 0.80, 0.83), (0.45, 0.45, 0.47), 0.45, 0.8, 0.3)
+
+
+SETTINGS = {"demo_clean": _clean}  # setting -> the episode's appearance
+
+
+def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> sapien.Pose:
+    """Pose of a camera (x forward, z up) at `eye` that looks at `target`."""
+    forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
+    left = np.cross([0.0, 0.0, 1.0], forward)
+    left /= np.linalg.norm(left)
+    return pose_of(eye, np.stack([forward, left, np.cross(forward, left)], axis=1))
+
+
+class TwoArmEnv(BaseEnv):
+    """A tabletop with two ViperX arms.
+
+    Every reset builds the scene anew: solver and contact caches then carry nothing over from one episode to the next.
+
+    Args:
+        setting: how the surroundings vary, a key of `SETTINGS`.
+        image_size: (H, W) of the three cameras.
+
+    Raises:
+        ConfigError: unknown setting.
+    """
+
+    SUPPORTED_ROBOTS: ClassVar[list[str]] = [UID]
+    SUPPORTED_REWARD_MODES = ("sparse", "none")
+    horizon: ClassVar[int]
+
+    def __init__(
+        self, *args: Any, setting: str = "demo_clean", image_size: tuple[int, int] = (120, 160), **kwargs: Any
+    ) -> None:
+        if setting not in SETTINGS:
+            raise ConfigError("setting", " or ".join(SETTINGS), repr(setting), "Choose one of these.")
+        self.setting, self.image_size = setting, image_size
+        self.command: np.ndarray = HOME_ACTION.copy()  # (14,)
+        self.succeeded = False
+        self._touches: list[Touch] | None = None
+        kwargs.setdefault("robot_uids", UID)
+        kwargs.setdefault("sim_backend", "physx_cpu")
+        kwargs.setdefault("render_backend", "cpu")
+        super().__init__(*args, **kwargs)
+
+    # ---------------------------------------------------------------------------------------------- what a task fills in
+
+    @abstractmethod
+    def build(self, rng: np.random.Generator) -> None:
+        """Put the props of an episode into the scene, drawn from `rng`."""
+
+    @abstractmethod
+    def condition(self) -> bool:
+        """Whether the task's condition is met now."""
+
+    @abstractmethod
+    def expert(self, arms: Arms) -> Iterator[ExpertStep]:
+        """The scripted solution; reads object poses as it goes."""
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Where things are, as plain containers."""
+
+    # ---------------------------------------------------------------------------------------------------- what a task uses
+
+    def touches(self) -> list[Touch]:
+        """Contacts between fingers and props at the end of the last control step."""
+        if self._touches is None:
+            self._touches = list(self._find_touches())
+        return self._touches
+
+    def opening(self, side: str) -> float:
+        """Commanded opening of a gripper, 0 closed .. 1 open."""
+        return float(self.command[6 if side == "left" else 13])
+
+    def tool_pose(self, side: str) -> sapien.Pose:
+        """Measured tool pose in the world."""
+        return self.agent.robot.links_map[f"{side}_tcp"]._objs[0].entity_pose
+
+    # -------------------------------------------------------------------------------------------------- ManiSkill's hooks
+
+    @property
+    def _default_sim_config(self) -> SimConfig:
+        scene = SceneConfig(solver_position_iterations=10, enable_enhanced_determinism=True)
+        return SimConfig(sim_freq=SIMULATION_HZ, control_freq=CONTROL_HZ, scene_config=scene)
+
+    @property
+    def _default_sensor_configs(self) -> list[CameraConfig]:
+        height, width = self.image_size
+        links = self.agent.robot.links_map
+        wrist = look_at((-0.02, 0.0, 0.11), (0.17, 0.0, 0.0))
+        cameras = {
+            "cam_high": (look_at((0.0, -0.62, 0.72), (0.0, 0.06, 0.05)), 58.0, None),
+            "cam_right_wrist": (wrist, 70.0, links["right_gripper_link"]),
+            "cam_left_wrist": (wrist, 70.0, links["left_gripper_link"]),
+        }
+        return [
+            CameraConfig(name, pose, width, height, np.deg2rad(fov), near=0.01, far=5.0, mount=mount)
+            for name, (pose, fov, mount) in ((name, cameras[name]) for name in CAMERAS)
+        ]
+
+    @property
+    def _default_human_render_camera_configs(self) -> CameraConfig:
+        pose = look_at((0.0, -0.75, 0.65), (0.0, 0.0, 0.05))
+        return CameraConfig("render_camera", pose, 512, 384, np.deg2rad(55), near=0.01, far=5.0)
+
+    def reset(self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None) -> Any:
+        """Build a new episode; see `BaseEnv.reset`."""
+        return super().reset(seed=seed, options={**(options or {}), "reconfigure": True})
+
+    def _load_agent(self, options: dict[str, Any]) -> None:
+        super()._load_agent(options, sapien.Pose())
+
+    def _load_scene(self, options: dict[str, Any]) -> None:
+        rng = np.random.default_rng(int(self._episode_seed[0]))
+        self._appearance = look = SETTINGS[self.setting](rng)
+        Prop(self.scene).box((1.5, 1.1, 0.04), (0.0, 0.0, -0.02), look.table).build("table", sapien.Pose(), static=True)
+        room = Prop(self.scene)
+        for x, y in ((2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)):  # the shader's sky is black
+            size = (0.02 if x else 4.0, 0.02 if y else 4.0, 4.0)
+            room.box(size, (x, y, 1.0), look.wall, solid=False)
+        room.box((4.0, 4.0, 0.02), (0.0, 0.0, -0.75), look.floor, solid=False)
+        room.box((4.0, 4.0, 0.02), (0.0, 0.0, 2.5), look.wall, solid=False)
+        room.build("room", sapien.Pose(), static=True)
+        self.build(rng)
+
+    def _load_lighting(self, options: dict[str, Any]) -> None:
+        look = self._appearance
+        self.scene.set_ambient_light([look.ambient] * 3)
+        self.scene.add_directional_light([0.3, 0.4, -1.0], [look.key_light] * 3)
+        self.scene.add_directional_light([-0.5, -0.3, -1.0], [look.fill_light] * 3)
+
+    def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
+        self.command, self.succeeded, self._touches = HOME_ACTION.copy(), False, None
+        home = torch.from_numpy(self.agent.keyframes["rest"].qpos)[None]
+        self.agent.reset(home)
+        robot = self.agent.robot
+        robot.set_joint_drive_targets(home, robot.active_joints, torch.arange(len(robot.active_joints)))
+        for _ in range(round(SETTLE_SECONDS * SIMULATION_HZ)):
+            self.scene.step()
+        self.agent.reset(home)
+        self._clear_sim_state()
+
+    def _step_action(self, action: Any) -> Any:
+        if action is not None:
+            self.command = np.clip(np.asarray(action, np.float32).reshape(-1), ACTION_LOW, ACTION_HIGH)
+        return super()._step_action(action)
+
+    def _after_control_step(self) -> None:
+        self._touches = None
+        self.succeeded = self.succeeded or bool(self.condition())
+
+    def evaluate(self) -> dict[str, torch.Tensor]:
+        """Whether the task's condition has been met at some control step of the episode."""
+        return {"success": torch.tensor([self.succeeded])}
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Any]:
+        return {}
+
+    def _find_touches(self) -> Iterator[Touch]:
+        fingers, robot = {}, set()
+        for link in self.agent.robot.links:
+            robot.add(link._objs[0].entity.per_scene_id)
+            if link.name.endswith("finger_link"):
+                fingers[link._objs[0].entity.per_scene_id] = link.name.split("_")[0]
+        for contact in self.scene.sub_scenes[0].physx_system.get_contacts():
+            ids = [body.entity.per_scene_id for body in contact.bodies]
+            points = [point.position for point in contact.points if np.linalg.norm(point.impulse) > TOUCH_IMPULSE]
+            for finger, other, body in ((ids[0], ids[1], 1), (ids[1], ids[0], 0)):
+                if points and finger in fingers and other not in robot:
+                    name = contact.bodies[body].entity.name.removeprefix("scene-0_")
+                    yield Touch(fingers[finger], name, np.asarray(points, np.float64))
+
+
+def side_of(x: float) -> str:
+    """The arm on whose side of the table a point lies."""
+    return SIDES[0] if x < 0 else SIDES[1]

@@ -1,0 +1,174 @@
+"""One task in one simulator, reused over episodes: plain numpy in and out."""
+
+import os
+from collections.abc import Iterator
+from types import TracebackType
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ugr_lightning.contract import ACTION_DIM, CAMERAS
+from ugr_lightning.errors import ConfigError, NumericsError, SimulationError
+from ugr_lightning.sim.expert import Arms, ExpertStep
+from ugr_lightning.sim.kinematics import SIDES, UnreachableError
+from ugr_lightning.sim.tasks import load_task
+
+__all__ = ["ExpertStep", "Frame", "Simulator"]
+
+
+class Frame(NamedTuple):
+    """Everything measurable at one control step.
+
+    Args:
+        images: (V, H, W, 3) uint8 RGB in the order of `contract.CAMERAS`; (0, H, W, 3) without rendering.
+        commanded: (14,) float32, the joint targets in force: home after reset, else the last action, clipped.
+        measured: (14,) float32, gripper 0 closed .. 1 open.
+        endpose: (2, 7) float64, world tool pose of the left and the right arm: x y z qw qx qy qz.
+        contacts: (2,) bool, the left / right fingers touch something that is not the robot.
+        success: the task's condition was met at some control step of this episode.
+    """
+
+    images: np.ndarray
+    commanded: np.ndarray
+    measured: np.ndarray
+    endpose: np.ndarray
+    contacts: np.ndarray
+    success: bool
+
+
+class Simulator:
+    """Runs episodes of a task; a context manager.
+
+    Set `OMP_NUM_THREADS=1` in processes that simulate: SAPIEN uses one core, and torch's threads only get in its way.
+
+    Args:
+        task: a name from `task_names`.
+        setting: how the surroundings vary.
+        image_size: (H, W).
+        render: whether frames have images; without, no Vulkan is needed.
+        speed: of the expert; divides the durations of its motions.
+
+    Raises:
+        ConfigError: unknown task or setting, or an impossible image size or speed.
+        SimulationError: SAPIEN is not installed.
+    """
+
+    def __init__(
+        self,
+        task: str,
+        *,
+        setting: str = "demo_clean",
+        image_size: tuple[int, int] = (120, 160),
+        render: bool = True,
+        speed: float = 1.0,
+    ) -> None:
+        if min(image_size) < 1:
+            raise ConfigError("image_size", "two positive numbers (H, W)", image_size, "Use e.g. (120, 160).")
+        if not speed > 0:
+            raise ConfigError("speed", "a positive number", speed, "Use 1.0 for the normal speed.")
+        environment = load_task(task)
+        self.task, self.setting, self.image_size, self.speed = task, setting, tuple(image_size), speed
+        self.horizon: int = environment.horizon
+        self._render = render
+        self._seed: int | None = None
+        os.environ.setdefault("MS_RENDERER_LOG_LEVEL", "error")
+        self._env = environment(
+            setting=setting, image_size=image_size, obs_mode="none", render_backend="cpu" if render else "none"
+        )
+        self.control_hz = float(self._env.control_freq)
+
+    def __enter__(self) -> "Simulator":
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def reset(self, seed: int) -> Frame:
+        """Start the episode of a seed; the same one bit for bit, whatever ran before."""
+        self._env.reset(seed=int(seed))
+        self._seed = int(seed)
+        self._scene_info = {"seed": self._seed, **self._env.describe()}
+        return self._frame()
+
+    def step(self, action: np.ndarray) -> Frame:
+        """Command joint targets for one control step.
+
+        Args:
+            action: (14,) radians and gripper openings; clipped to the limits.
+
+        Raises:
+            NumericsError: the action has a NaN or an infinity; the simulator has not seen it.
+            SimulationError: `reset` has not been called.
+        """
+        self._require_episode()
+        action = np.asarray(action, np.float32)
+        if action.shape != (ACTION_DIM,):
+            raise SimulationError("action", f"shape ({ACTION_DIM},)", action.shape, "Give one 14-dimensional command.")
+        if not np.isfinite(action).all():
+            bad = np.flatnonzero(~np.isfinite(action)).tolist()
+            raise NumericsError("action", "finite numbers", f"NaN or infinity at {bad}", "Check the policy's output.")
+        self._env._step_action(action)
+        return self._frame()
+
+    def expert(self) -> Iterator[ExpertStep]:
+        """The scripted expert of the current episode.
+
+        It reads the simulator's state as it goes, so each of its steps has to be executed (with or without noise)
+        before the next is asked for. It ends early where an object has got out of reach: the episode is then no success.
+        """
+        self._require_episode()
+        try:
+            yield from self._env.expert(Arms(self._env.command, self.speed))
+        except UnreachableError:
+            return
+
+    def scene_info(self) -> dict[str, Any]:
+        """Seed and where things were at reset, as plain containers."""
+        self._require_episode()
+        return self._scene_info
+
+    def camera_parameters(self) -> dict[str, dict[str, np.ndarray]]:
+        """Per camera `intrinsic_cv` (3, 3), `extrinsic_cv` (3, 4) and `cam2world_gl` (4, 4) at this moment."""
+        self._require_episode()
+        sensors = self._env._sensors if self._render else {}
+        return {
+            name: {key: value[0].numpy().copy() for key, value in sensors[name].get_params().items()}
+            for name in CAMERAS
+            if name in sensors
+        }
+
+    def close(self) -> None:
+        """Free the scene."""
+        self._env.close()
+        self._seed = None
+
+    def _require_episode(self) -> None:
+        if self._seed is None:
+            raise SimulationError("simulator", "a running episode", "none", "Call reset(seed) first.")
+
+    def _frame(self) -> Frame:
+        poses = [self._env.tool_pose(side) for side in SIDES]
+        touching = {touch.side for touch in self._env.touches()}
+        return Frame(
+            images=self._pictures(),
+            commanded=self._env.command.copy(),
+            measured=self._env.agent.measured(),
+            endpose=np.array([[*pose.p, *pose.q] for pose in poses], np.float64),
+            contacts=np.array([side in touching for side in SIDES]),
+            success=self._env.succeeded,
+        )
+
+    def _pictures(self) -> np.ndarray:
+        height, width = self.image_size
+        if not self._render:
+            return np.zeros((0, height, width, 3), np.uint8)
+        images = np.empty((len(CAMERAS), height, width, 3), np.uint8)
+        self._env.scene.sub_scenes[0].update_render()
+        cameras = [self._env._sensors[name].camera._render_cameras[0] for name in CAMERAS]
+        for camera in cameras:
+            camera.take_picture()
+        for image, camera in zip(images, cameras, strict=True):
+            image[:] = camera.get_picture("Color")[..., :3]  # (H, W, 4) uint8, r8g8b8a8unorm
+        return images
