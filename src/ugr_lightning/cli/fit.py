@@ -1,0 +1,165 @@
+"""`ugr fit` and `ugr validate`: LightningCLI with runs, includes and checkpoints that are found across processes."""
+
+import argparse
+import logging
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from lightning.pytorch import Trainer
+from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
+
+from ugr_lightning.cli.config import expand_includes, explain, run_name
+from ugr_lightning.cli.runs import next_version, resolve_checkpoint, versions_of
+from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.errors import CheckpointError, UGRError
+from ugr_lightning.training.callbacks.averaging import WeightAverage
+from ugr_lightning.training.callbacks.checkpoints import PolicyCheckpoints
+from ugr_lightning.training.callbacks.figures import ValidationFigures
+from ugr_lightning.training.callbacks.rng import CounterSeeds
+from ugr_lightning.training.callbacks.rollout import RolloutEvaluation
+from ugr_lightning.training.checkpoint import AtomicCheckpointIO
+from ugr_lightning.training.module import PolicyModule
+
+_RUN_FOLDER = "UGR_RUN_FOLDER"  # tells the other processes of a distributed run which folder the first one chose
+
+
+class UGRCLI(LightningCLI):
+    """LightningCLI for policies: `fit` and `validate`.
+
+    Args:
+        args: command line, starting with the subcommand, includes expanded.
+        default_run: name of the run where `--run` is not given.
+    """
+
+    def __init__(self, args: list[str], default_run: str) -> None:
+        self.default_run = default_run
+        quiet = {"exit_on_error": False}
+        super().__init__(
+            PolicyModule,
+            ChunkDataModule,
+            save_config_callback=SaveConfigCallback,
+            save_config_kwargs={"overwrite": True},
+            trainer_defaults={
+                "default_root_dir": "runs",
+                "max_epochs": -1,
+                "num_sanity_val_steps": 0,
+                "enable_model_summary": False,
+                "log_every_n_steps": 10,
+            },
+            seed_everything_default=0,
+            parser_kwargs={"exit_on_error": False, **{name: dict(quiet) for name in self.subcommands()}},
+            args=args,
+            auto_configure_optimizers=False,
+            load_from_checkpoint_support=False,
+        )
+
+    @staticmethod
+    def subcommands() -> dict[str, set[str]]:
+        """The trainer's methods that are subcommands here, with the arguments that are not for the user."""
+        return {
+            "fit": {"model", "train_dataloaders", "val_dataloaders", "datamodule", "weights_only"},
+            "validate": {"model", "dataloaders", "datamodule", "weights_only"},
+        }
+
+    def add_arguments_to_parser(self, parser: LightningArgumentParser) -> None:
+        """The run's name, the callbacks' settings, and links that keep data and policy in agreement."""
+        parser.add_argument("--run", type=str | None, default=None, help="name of the run, or the folder of one")
+        parser.add_argument("--include", type=_merged_already, default=None, help="configs that come before this one")
+        parser.add_lightning_class_args(WeightAverage, "average")
+        parser.add_lightning_class_args(PolicyCheckpoints, "checkpoints")
+        parser.add_lightning_class_args(RolloutEvaluation, "rollout")
+        parser.add_lightning_class_args(ValidationFigures, "figures")
+        parser.set_defaults({"model.policy": {"class_path": "ugr_lightning.models.act.ACT"}})
+        parser.link_arguments("model", "data.cameras", lambda module: list(module.policy.cameras), "instantiate")
+        parser.link_arguments("model", "data.chunk_length", lambda module: module.policy.chunk_length, "instantiate")
+
+    def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
+        """Parse without Lightning's warning that `sys.argv` is there too."""
+        self.config = parser.parse_args(args)
+
+    def _parse_ckpt_path(self) -> None:
+        """Resolve `best` and `last` before Lightning, which would go on with fresh weights, sees them."""
+        config = self.config[self.config.subcommand]
+        config.run = config.run or self.default_run
+        if config.get("ckpt_path"):
+            config.ckpt_path = str(resolve_checkpoint(config.ckpt_path, config.run, Path(config.trainer.default_root_dir)))
+            print(f"checkpoint: {config.ckpt_path}")
+        elif self.config.subcommand == "validate":
+            fix = "Add --ckpt_path best (or last, or a file)."
+            raise CheckpointError("--ckpt_path", "a checkpoint to validate", "none", fix)
+
+    def instantiate_trainer(self, **kwargs: Any) -> Trainer:
+        """The trainer with both loggers in the run's folder and atomic checkpoints."""
+        config = self._get(self.config_init, "trainer")
+        if config.get("logger") is None:
+            kwargs["logger"] = self._loggers(self._run_folder(config))
+        kwargs["plugins"] = [*_listed(config.get("plugins")), AtomicCheckpointIO()]
+        config["callbacks"] = [*_listed(config.get("callbacks")), CounterSeeds(self._get(self.config, "seed_everything"))]
+        return super().instantiate_trainer(**kwargs)
+
+    def _run_folder(self, trainer_config: Any) -> Path:
+        """A new `version_N`, or the folder of the checkpoint when a fit goes on from its own `last.ckpt`."""
+        if _RUN_FOLDER in os.environ and int(os.environ.get("LOCAL_RANK", "0")) > 0:
+            return Path(os.environ[_RUN_FOLDER])
+        checkpoint = self._get(self.config, "ckpt_path")
+        home = Path(trainer_config["default_root_dir"]) / self._get(self.config, "run")
+        if self.subcommand == "fit" and checkpoint and Path(checkpoint).parent in versions_of(Path(checkpoint).parents[1]):
+            folder = Path(checkpoint).parent
+        else:
+            folder = home / f"version_{next_version(home)}"
+        os.environ[_RUN_FOLDER] = str(folder)
+        return folder
+
+    def _loggers(self, folder: Path) -> list[Any]:
+        where: dict[str, Any] = {"save_dir": str(folder.parents[1]), "name": folder.parent.name, "version": folder.name}
+        return [TensorBoardLogger(default_hp_metric=False, **where), CSVLogger(**where)]
+
+    def after_instantiate_classes(self) -> None:
+        """Let the data module record what is missing, with the simulator's help."""
+        from ugr_lightning.cli.recording import record_demonstrations
+
+        self.datamodule.recorder = record_demonstrations
+
+
+def _listed(value: Any) -> list[Any]:
+    if value is None:
+        return []
+    return list(value) if isinstance(value, (list, tuple)) else [value]
+
+
+def _merged_already(value: Any) -> None:
+    """`include` has been resolved before parsing; nothing of it remains."""
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr fit` or `ugr validate`.
+
+    Args:
+        command: `fit` or `validate`.
+        argv: what follows it.
+
+    Raises:
+        ConfigError: an unknown key or a value that does not fit.
+    """
+    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
+    warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
+    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: "💡" not in record.getMessage())
+    torch.set_num_threads(max(1, len(os.sched_getaffinity(0))) if "OMP_NUM_THREADS" not in os.environ else torch.get_num_threads())
+    try:
+        UGRCLI([command, *expand_includes(argv)], run_name(argv))
+    except argparse.ArgumentError as error:
+        cause: BaseException | None = error
+        while cause is not None and not isinstance(cause, UGRError):
+            cause = cause.__cause__ or cause.__context__
+        raise (cause if isinstance(cause, UGRError) else explain(error, None)) from None
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(run(sys.argv[1], sys.argv[2:]))

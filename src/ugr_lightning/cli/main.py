@@ -1,0 +1,82 @@
+"""`ugr`: the one place that knows the command line. Each subcommand is one function; none is imported before it is asked for."""
+
+import importlib
+import os
+import sys
+from collections.abc import Sequence
+
+from ugr_lightning.errors import UGRError
+
+COMMANDS: dict[str, tuple[str, str]] = {
+    "demo": ("ugr_lightning.cli.demo:demo", "the whole loop in minutes: record, train, evaluate, show a table"),
+    "doctor": ("ugr_lightning.cli.commands:doctor", "check this machine and say what to do"),
+    "tasks": ("ugr_lightning.cli.commands:tasks", "list the simulated tasks"),
+    "collect": ("ugr_lightning.cli.commands:collect", "record demonstrations of a task's scripted expert"),
+    "fit": ("ugr_lightning.cli.fit:run", "train a policy; records missing demonstrations first"),
+    "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
+    "test": ("ugr_lightning.cli.commands:test", "success of a checkpoint on the evaluation seeds, both execution modes"),
+    "rollout": ("ugr_lightning.cli.commands:rollout", "let a checkpoint, or zero, random or expert, act in a task"),
+    "inspect": ("ugr_lightning.cli.inspect:inspect", "say what a checkpoint, an episode or a folder is"),
+    "bench": ("ugr_lightning.cli.commands:bench", "measure speed on this machine"),
+}
+
+FIRST_RUN = """ugr-lightning: train and understand action-chunking robot policies.
+
+First run:
+  ugr doctor                                  is everything there?
+  ugr fit --config configs/uncert.yaml        record demonstrations, train, roll out
+  ugr test --run uncert --ckpt_path best      success on the evaluation seeds
+  tensorboard --logdir runs                   watch it
+
+Commands (`ugr COMMAND --help`):
+"""
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one subcommand.
+
+    Args:
+        argv: arguments without the program's name; `sys.argv` by default.
+
+    Returns:
+        Exit code: 0 fine, 2 a problem the user can solve, 130 interrupted.
+    """
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(FIRST_RUN + "\n".join(f"  {name:<10}{about}" for name, (_, about) in COMMANDS.items()))
+        return 0
+    try:
+        return _run(arguments[0], arguments[1:])
+    except UGRError as error:
+        if os.environ.get("UGR_DEBUG") == "1":
+            raise
+        print(f"ugr {arguments[0]}: {type(error).__name__}\n{error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"ugr {arguments[0]}: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:  # `ugr ... | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+
+
+def _run(command: str, arguments: list[str]) -> int:
+    if command == "--version":
+        from importlib.metadata import version
+
+        print(version("ugr-lightning"))
+        return 0
+    if command not in COMMANDS:
+        import difflib
+
+        from ugr_lightning.errors import ConfigError
+
+        near = difflib.get_close_matches(command, COMMANDS, n=1)
+        fix = f"Did you mean `ugr {near[0]}`?" if near else "`ugr` alone lists the commands."
+        raise ConfigError("ugr", "a command", command, fix)
+    module, _, name = COMMANDS[command][0].partition(":")
+    return int(getattr(importlib.import_module(module), name)(command, arguments) or 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,162 @@
+"""Trains anything that speaks ChunkPolicy: steps, optimiser, logging. The mathematics is the policy's own."""
+
+import math
+from pathlib import Path
+from typing import Any, Literal
+
+import torch
+from lightning.pytorch import LightningModule
+from torch import Tensor, nn
+from torchmetrics import Metric
+from torchmetrics.aggregation import MeanMetric
+from torchmetrics.regression import SpearmanCorrCoef
+
+from ugr_lightning.contract import Batch, Chunk, ChunkPolicy
+from ugr_lightning.errors import NumericsError
+from ugr_lightning.training.checkpoint import describe
+
+
+class PolicyModule(LightningModule):
+    """A policy in training: AdamW, a learning-rate schedule and the log.
+
+    Args:
+        policy: the policy to train.
+        learning_rate: peak step size of AdamW (PAPER.tex, section on implementation: 1e-5).
+        backbone_learning_rate: step size of parameters whose name contains `backbone`; null means `learning_rate`.
+        weight_decay: AdamW's decoupled weight decay.
+        warmup_steps: optimiser steps over which the learning rate rises linearly.
+        schedule: what follows the warm-up: `constant`, or `cosine` down to a hundredth at the trainer's last step.
+    """
+
+    def __init__(
+        self,
+        policy: ChunkPolicy,
+        learning_rate: float = 1e-5,
+        backbone_learning_rate: float | None = None,
+        weight_decay: float = 1e-4,
+        warmup_steps: int = 0,
+        schedule: Literal["constant", "cosine"] = "constant",
+    ) -> None:
+        super().__init__()
+        self.policy = policy
+        self.learning_rate = learning_rate
+        self.backbone_learning_rate = learning_rate if backbone_learning_rate is None else backbone_learning_rate
+        self.weight_decay = weight_decay
+        self.warmup_steps = warmup_steps
+        self.schedule = schedule
+        self.scores = nn.ModuleDict(_scores())
+        self.last_chunk: Chunk | None = None  # of the validation batch at hand; the figures read it
+
+    def setup(self, stage: str) -> None:
+        """Hand the training episodes' statistics to the policy; a checkpoint restored later overwrites them."""
+        statistics = self.trainer.datamodule.statistics  # type: ignore[attr-defined]
+        self._action_std = statistics.action_std
+        if stage == "fit":
+            self.policy.set_statistics(statistics)
+
+    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
+        """The objective of one batch; every named term goes to the log."""
+        terms = self.policy.losses(batch)
+        if not all(bool(torch.isfinite(term)) for term in terms.values()):
+            raise self._not_finite(batch, terms)
+        self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=len(batch.state))
+        return terms["loss"]
+
+    def validation_step(self, batch: Batch, batch_idx: int) -> None:
+        """The objective, and the errors of what the robot would execute (latent z = 0)."""
+        terms = self.policy.losses(batch)
+        self.log_dict({f"val/{name}": term for name, term in terms.items()}, batch_size=len(batch.state), sync_dist=True)
+        chunk = self.last_chunk = self.policy.predict(batch.observation)
+        self._score(batch, chunk)
+
+    def step_error(self, actions: Tensor, batch: Batch) -> Tensor:
+        """Mean absolute error of each step over its dimensions, in standard deviations of the training actions.
+
+        Args:
+            actions: (B, K, A), robot units.
+            batch: the demonstrated chunks.
+
+        Returns:
+            (B, K) float32.
+        """
+        std = self._action_std.to(batch.actions)  # (A,)
+        return ((actions.float() - batch.actions).abs() / std).mean(-1)  # (B, K)
+
+    def _score(self, batch: Batch, chunk: Chunk) -> None:
+        error, valid = self.step_error(chunk.actions, batch), batch.valid  # (B, K), (B, K)
+        coarse = error if chunk.coarse is None else self.step_error(chunk.coarse, batch)  # (B, K)
+        self._mean("action_error", error, valid)
+        self._mean("first_frame_error", error, valid & (batch.step == 0)[:, None])
+        if chunk.refined is not None:
+            self._mean("coarse_error", coarse, valid)
+            self._mean("refined_error", error, valid)
+            self._mean("coarse_error_inside_mask", coarse, valid & chunk.refined)
+            self._mean("error_inside_mask", error, valid & chunk.refined)
+            self._mean("error_outside_mask", error, valid & ~chunk.refined)
+        if chunk.log_variance is not None:
+            # the head is trained on the error of the coarse actions (paper, uncertainty loss)
+            self._metric("spearman").update(chunk.log_variance[valid].float(), coarse[valid])
+            self.log("val/spearman", self._metric("spearman"), on_step=False, on_epoch=True)
+
+    def _mean(self, name: str, error: Tensor, where: Tensor) -> None:
+        self._metric(name).update(error[where])
+        self.log(f"val/{name}", self._metric(name), on_step=False, on_epoch=True, prog_bar=name == "action_error")
+
+    def _metric(self, name: str) -> Metric:
+        metric = self.scores[name]
+        assert isinstance(metric, Metric)
+        return metric
+
+    def configure_optimizers(self) -> dict[str, Any]:
+        """AdamW with the backbone as a group of its own, and a schedule that counts optimiser steps."""
+        named = [(name, p) for name, p in self.policy.named_parameters() if p.requires_grad]
+        groups = [
+            {"params": [p for name, p in named if "backbone" not in name], "lr": self.learning_rate},
+            {"params": [p for name, p in named if "backbone" in name], "lr": self.backbone_learning_rate},
+        ]
+        groups = [group for group in groups if group["params"]]
+        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        total = int(self.trainer.estimated_stepping_batches) if self.schedule == "cosine" else 0
+        scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step, total))
+        return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}
+
+    def learning_rate_factor(self, step: int, total_steps: int) -> float:
+        """The factor on the peak learning rate at one optimiser step.
+
+        Args:
+            step: optimiser steps done.
+            total_steps: optimiser steps of the whole training (cosine only).
+        """
+        if step < self.warmup_steps:
+            return (step + 1) / self.warmup_steps
+        if self.schedule == "constant":
+            return 1.0
+        done = min(1.0, (step - self.warmup_steps) / max(1, total_steps - self.warmup_steps))
+        return 0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * done))
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Make the checkpoint complete in itself."""
+        checkpoint["policy"] = describe(self.policy, self.trainer.datamodule)  # type: ignore[attr-defined]
+
+    def _not_finite(self, batch: Batch, terms: dict[str, Tensor]) -> NumericsError:
+        """Write what is needed to replay the step, and name it."""
+        step = self.trainer.global_step
+        dump = Path(self.trainer.log_dir or self.trainer.default_root_dir) / f"not_finite_step{step}.pt"
+        dump.parent.mkdir(parents=True, exist_ok=True)
+        content = {"batch": batch._asdict(), "state_dict": self.state_dict(), "policy": self.policy.blueprint()}
+        torch.save(content, dump)
+        bad = ", ".join(f"{name} = {float(term.detach()):g}" for name, term in terms.items() if not torch.isfinite(term))
+        samples = ", ".join(f"{e}:{t}" for e, t in zip(batch.episode.tolist(), batch.step.tolist(), strict=True))
+        return NumericsError(
+            f"training step {step}",
+            "finite losses",
+            f"{bad} on episode:step {samples}",
+            f"The batch and the weights are in {dump}; look at those episodes, or lower the learning rate. "
+            "`ugr fit --ckpt_path last` goes on from the last checkpoint.",
+        )
+
+
+def _scores() -> dict[str, Metric]:
+    means = "action_error first_frame_error coarse_error refined_error".split()
+    means += "coarse_error_inside_mask error_inside_mask error_outside_mask".split()
+    return {name: MeanMetric(nan_strategy="disable") for name in means} | {"spearman": SpearmanCorrCoef()}
