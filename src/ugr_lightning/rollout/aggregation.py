@@ -1,0 +1,143 @@
+"""How a stream of overlapping action chunks becomes one action per control step."""
+
+from abc import ABC, abstractmethod
+
+import numpy as np
+
+from ugr_lightning.contract import ACTION_DIM
+from ugr_lightning.errors import ConfigError
+
+AGGREGATE = "aggregate"
+
+
+class Execution(ABC):
+    """Turns chunks into actions for several environment slots that run independently of each other.
+
+    Per control step and slot: ask `needs_query`; if so predict a chunk and `push` it; then take `next`.
+    """
+
+    name: str
+
+    @abstractmethod
+    def reset(self, slot: int) -> None:
+        """Forget everything about a slot, at the start of an episode."""
+
+    @abstractmethod
+    def needs_query(self, slot: int) -> bool:
+        """Whether the slot wants a new chunk before its next action."""
+
+    @abstractmethod
+    def push(self, slot: int, chunk: np.ndarray) -> None:
+        """Give a slot the chunk (K, A) that was predicted at its current step."""
+
+    @abstractmethod
+    def next(self, slot: int) -> np.ndarray:
+        """The action (A,) float32 of the slot's current step; moves the slot on by one step."""
+
+
+class TemporalAggregation(Execution):
+    """Average of all predictions that were made for a step, weighted exp(-decay i), i = 0 for the oldest.
+
+    Kept online as K running sums per slot: a prediction that arrives later always has a larger i, so the weights of
+    the earlier ones never change. Needs O(K A) memory where the table of the public codes needs O(T (T + K) A).
+
+    Args:
+        chunk_length: K.
+        action_dim: A.
+        decay: weight decay per prediction; positive means that older predictions count more.
+        slots: number of environment slots.
+
+    Source: FACTS 6.1; DESIGN 4.
+    """
+
+    name = AGGREGATE
+
+    def __init__(self, chunk_length: int, action_dim: int = ACTION_DIM, decay: float = 0.01, slots: int = 1) -> None:
+        self._decay = decay
+        self._sums = np.zeros((slots, chunk_length, action_dim))  # float64: sums of up to K terms
+        self._weights = np.zeros((slots, chunk_length))
+        self._counts = np.zeros((slots, chunk_length))
+
+    def reset(self, slot: int) -> None:
+        """Forget everything about a slot."""
+        for table in (self._sums, self._weights, self._counts):
+            table[slot] = 0.0
+
+    def needs_query(self, slot: int) -> bool:
+        """Always: every step is predicted anew."""
+        return True
+
+    def push(self, slot: int, chunk: np.ndarray) -> None:
+        """Add a chunk (K, A) that starts at the slot's current step."""
+        if chunk.shape != self._sums.shape[1:]:
+            raise ConfigError("chunk", self._sums.shape[1:], chunk.shape, "Build the aggregation for this policy.")
+        weights = np.exp(-self._decay * self._counts[slot])  # (K,)
+        self._sums[slot] += weights[:, None] * chunk  # (K, A)
+        self._weights[slot] += weights
+        self._counts[slot] += 1
+
+    def next(self, slot: int) -> np.ndarray:
+        """The weighted average (A,) for the current step; moves on by one step."""
+        if self._counts[slot, 0] == 0:
+            raise RuntimeError(f"slot {slot} has no prediction for its current step: push a chunk first")
+        action = self._sums[slot, 0] / self._weights[slot, 0]  # (A,)
+        for table in (self._sums, self._weights, self._counts):
+            table[slot, :-1] = table[slot, 1:]
+            table[slot, -1] = 0.0
+        return action.astype(np.float32)
+
+
+class ChunkExecution(Execution):
+    """Executes the first steps of each chunk as they are, then asks for a new one.
+
+    Args:
+        steps: how many steps of each chunk are executed, at most K.
+        slots: number of environment slots.
+    """
+
+    def __init__(self, steps: int, slots: int = 1) -> None:
+        self.name = str(steps)
+        self._steps = steps
+        self._chunks: list[np.ndarray | None] = [None] * slots
+        self._cursors = [0] * slots
+
+    def reset(self, slot: int) -> None:
+        """Forget the slot's chunk."""
+        self._chunks[slot] = None
+
+    def needs_query(self, slot: int) -> bool:
+        """True at the start of an episode and whenever the steps of the last chunk are used up."""
+        return self._chunks[slot] is None or self._cursors[slot] >= self._steps
+
+    def push(self, slot: int, chunk: np.ndarray) -> None:
+        """Replace the slot's chunk by a new one (K, A)."""
+        self._chunks[slot], self._cursors[slot] = np.array(chunk, np.float32), 0
+
+    def next(self, slot: int) -> np.ndarray:
+        """The next action (A,) of the slot's chunk."""
+        chunk = self._chunks[slot]
+        if chunk is None or self.needs_query(slot):
+            raise RuntimeError(f"slot {slot} has used up its chunk: push a new one first")
+        self._cursors[slot] += 1
+        return chunk[self._cursors[slot] - 1]
+
+
+def make_execution(execution: str | int, chunk_length: int, action_dim: int = ACTION_DIM, slots: int = 1) -> Execution:
+    """Build what the setting `execution` names.
+
+    Args:
+        execution: `aggregate`, or the number of steps (1 .. K) executed of each chunk.
+        chunk_length: K of the policy.
+        action_dim: A of the policy.
+        slots: number of environment slots.
+
+    Raises:
+        ConfigError: neither of the two.
+    """
+    if execution == AGGREGATE:
+        return TemporalAggregation(chunk_length, action_dim, slots=slots)
+    text = str(execution).strip()
+    if not text.isdigit() or not 1 <= int(text) <= chunk_length:
+        expected = f"`{AGGREGATE}` or a number of steps from 1 to {chunk_length}"
+        raise ConfigError("execution", expected, execution, "Say how the chunks are to be executed.")
+    return ChunkExecution(int(text), slots)

@@ -1,0 +1,129 @@
+"""Results of closed-loop episodes: one JSON line each, and what they add up to."""
+
+import json
+import math
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import NamedTuple
+
+from ugr_lightning.contract import EpisodeResult
+from ugr_lightning.errors import DataError
+
+Z_95 = 1.959963984540054
+"""The 97.5 % quantile of the normal distribution."""
+
+
+def wilson_interval(successes: int, n: int, z: float = Z_95) -> tuple[float, float]:
+    """Wilson score interval of a success rate.
+
+    Args:
+        successes: number of successes.
+        n: number of trials.
+        z: normal quantile; the default gives 95 %.
+
+    Returns:
+        lower and upper bound in 0 .. 1; (0, 1) when nothing has been tried.
+
+    Raises:
+        ValueError: successes is not within 0 .. n.
+    """
+    if not 0 <= successes <= n:
+        raise ValueError(f"{successes} successes of {n}")
+    if n == 0:
+        return 0.0, 1.0
+    rate, denominator = successes / n, 1.0 + z * z / n
+    centre = (rate + z * z / (2 * n)) / denominator
+    half = z / denominator * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
+    # the ends are exact at 0 and n, where rounding would leave 1e-17
+    return (0.0 if successes == 0 else centre - half), (1.0 if successes == n else centre + half)
+
+
+class Summary(NamedTuple):
+    """What a list of episodes adds up to; a crashed episode counts as a failure.
+
+    Args:
+        n: episodes.
+        successes: successful episodes.
+        rate: successes / n, 0 when there are none.
+        low, high: 95 % Wilson interval of the rate.
+        crashed: episodes in which the simulator or the policy failed.
+    """
+
+    n: int
+    successes: int
+    rate: float
+    low: float
+    high: float
+    crashed: int
+
+    def __str__(self) -> str:
+        text = f"{self.successes}/{self.n} = {self.rate:.0%} [{self.low:.0%}, {self.high:.0%}]"
+        return text + (f", {self.crashed} crashed" if self.crashed else "")
+
+
+def summarize(results: Iterable[EpisodeResult]) -> Summary:
+    """Count the successes of some episodes and put the 95 % Wilson interval beside the rate."""
+    outcomes = [(result.success and result.crash is None, result.crash is not None) for result in results]
+    n, successes = len(outcomes), sum(success for success, _ in outcomes)
+    low, high = wilson_interval(successes, n)
+    return Summary(n, successes, successes / n if n else 0.0, low, high, sum(crashed for _, crashed in outcomes))
+
+
+def success_table(results: Sequence[EpisodeResult]) -> str:
+    """A plain-text table: one row per (task, setting, policy, execution) in order of appearance, n and interval beside every rate."""
+    groups: dict[tuple[str, str, str, str], list[EpisodeResult]] = {}
+    for result in results:
+        groups.setdefault((result.task, result.setting, result.policy, result.execution), []).append(result)
+    rows = [("task", "setting", "policy", "execution", "success", "95 % interval", "crashed")]
+    for key, group in groups.items():
+        total = summarize(group)
+        interval = f"[{total.low:.1%}, {total.high:.1%}]"
+        rows.append((*key, f"{total.successes}/{total.n} = {total.rate:.1%}", interval, str(total.crashed)))
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
+    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+
+
+def append_result(path: str | Path, result: EpisodeResult) -> None:
+    """Append one line to a results file and force it onto the disk, so that a crash loses no finished episode."""
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    line = json.dumps(result.to_dict(), allow_nan=False) + "\n"
+    with path.open("ab+") as file:
+        if file.tell() > 0:  # a line that was cut off by a crash must not swallow this one
+            file.seek(-1, os.SEEK_END)
+            line = line if file.read(1) == b"\n" else "\n" + line
+        file.write(line.encode())
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_results(path: str | Path) -> list[EpisodeResult]:
+    """Read a results file.
+
+    Raises:
+        DataError: the file is missing, or a line is not a result; names the file and the line.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise DataError(path, "a results file", "no such file", "Write one with `ugr rollout`.")
+    known = {field.name for field in fields(EpisodeResult)}
+    results = []
+    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
+        if not line.strip():
+            continue
+        where, fix = f"{path}, line {number}", "Delete this line; the other lines are independent of it."
+        try:
+            entry = json.loads(line)
+        except ValueError as error:
+            raise DataError(where, "one JSON object", f"a broken line ({error})", fix) from error
+        if not isinstance(entry, dict) or not set(entry) <= known:
+            unknown = sorted(set(entry) - known) if isinstance(entry, dict) else type(entry).__name__
+            raise DataError(where, f"the keys {sorted(known)}", f"also {unknown}", fix)
+        try:
+            results.append(EpisodeResult(**entry))
+        except TypeError as error:
+            raise DataError(where, "a complete episode result", str(error), fix) from error
+    return results
