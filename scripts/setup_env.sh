@@ -36,7 +36,8 @@ complete_venv_module() {
   "$python" -c 'import ensurepip, venv' 2>/dev/null && return
   if [ "$(id -u)" = 0 ] && command -v apt-get >/dev/null; then
     say "this Python lacks ensurepip; installing the system package python3.11-venv"
-    apt-get update -qq && DEBIAN_FRONTEND=noninteractive apt-get install -y -qq --no-install-recommends python3.11-venv >&2
+    apt-get update -qq && DEBIAN_FRONTEND=noninteractive \
+      apt-get install -y -qq -o Dpkg::Use-Pty=0 --no-install-recommends python3.11-venv >/dev/null
   fi
   "$python" -c 'import ensurepip, venv' 2>/dev/null || stop \
     "$python cannot make virtual environments: its module ensurepip is missing." \
@@ -69,7 +70,7 @@ pip=("$VENV/bin/python" -m pip --disable-pip-version-check)
 index=$(torch_index "$python")
 torch=$(grep '^torch==' requirements.lock)
 
-say "installing $(grep -c '==' requirements.lock) pinned packages (about 2 GB on disk with a CPU-only torch); nothing outside $VENV is touched"
+say "installing $(grep -c '==' requirements.lock) pinned packages (2.3 GB on disk with a CPU-only torch); nothing outside $VENV is touched"
 failed="Packages could not be installed; pip's message above says which. With a slow or filtered network, run the same command again: what is there already is kept."
 # torch first and with its dependencies, because its CUDA build needs libraries that its CPU build does not; the lock bounds the rest.
 "${pip[@]}" install -q --constraint requirements.lock ${index:+--extra-index-url "$index"} "$torch" || stop "$failed"

@@ -66,7 +66,7 @@ install_driver() {
   fi
   say "installing system packages: apt-get install --no-install-recommends $arguments"
   # shellcheck disable=SC2086  # the arguments are meant to be split
-  apt-get update -qq && apt-get install -y -qq --no-install-recommends $arguments >&2
+  apt-get update -qq && apt-get install -y -qq -o Dpkg::Use-Pty=0 --no-install-recommends $arguments >/dev/null
 }
 
 if message=$(probe); then done_with "$message"; fi

@@ -1,0 +1,192 @@
+"""The rules that keep the rooms of the package apart, read from the source without importing it."""
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = "ugr_lightning"
+ROOT = Path(__file__).resolve().parent.parent
+SOURCE = ROOT / "src" / PACKAGE
+FILES = sorted(SOURCE.rglob("*.py"))
+
+# Who may be imported by whom: a room sees those listed and itself, nothing else.
+GROUND = {"contract", "errors", "blueprint"}
+ROOMS = {
+    "contract": {"blueprint"},
+    "errors": set(),
+    "blueprint": {"errors"},
+    "data": GROUND,
+    "models": GROUND,
+    "sim": GROUND,
+    "rollout": GROUND | {"data", "models", "sim"},
+    "training": GROUND | {"data", "models", "sim", "rollout"},
+    "analysis": GROUND | {"data", "models", "sim", "rollout"},
+    "bridges": GROUND | {"data", "models", "sim", "rollout"},
+    "cli": GROUND | {"data", "models", "sim", "rollout", "training", "analysis", "bridges"},
+}
+SIMULATORS = {"sapien", "mani_skill", "gymnasium"}
+LIGHTNING = {"lightning", "pytorch_lightning"}
+ACCOUNTS = {"wandb", "comet_ml", "neptune", "mlflow", "clearml"}
+VAGUE_NAMES = {"utils", "util", "common", "helpers", "helper", "misc", "manager"}
+VAGUE_SUFFIXES = ("Manager", "Helper", "Handler", "Utils")
+
+
+def module_name(path: Path) -> str:
+    """`data.formats.robotwin` for src/ugr_lightning/data/formats/robotwin.py."""
+    parts = path.relative_to(SOURCE).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(tree: ast.AST, module: str, is_package: bool = False) -> Iterator[tuple[int, str]]:
+    """Line and absolute dotted name of everything imported anywhere in a file; `from a import b` gives `a.b`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((node.lineno, alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            here = [PACKAGE, *filter(None, module.split("."))]
+            keep = len(here) - node.level + is_package if node.level else 0
+            base = ".".join([*here[:keep], *filter(None, [node.module])])
+            yield from ((node.lineno, f"{base}.{alias.name}") for alias in node.names)
+        elif isinstance(node, ast.Call) and node.args and isinstance(node.args[0], ast.Constant):
+            name = ast.unparse(node.func)
+            if name in ("importlib.import_module", "import_module", "__import__"):
+                yield node.lineno, str(node.args[0].value)
+
+
+def imports_at_top_level(tree: ast.Module) -> set[str]:
+    """Outer packages that importing the file imports at once; functions and `if TYPE_CHECKING` do not count."""
+    todo, found = list(tree.body), set()
+    while todo:
+        node = todo.pop()
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            continue
+        if isinstance(node, ast.If) and "TYPE_CHECKING" in ast.unparse(node.test):
+            todo.extend(node.orelse)
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add(str(node.module).split(".")[0])
+        else:
+            todo.extend(
+                child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt | ast.ExceptHandler)
+            )
+    return found
+
+
+def violations(tree: ast.AST, module: str, is_package: bool = False) -> list[str]:
+    """Every import of a file that the rules forbid, as `line: what`."""
+    room = module.split(".")[0]
+    found = []
+    for line, name in imports(tree, module, is_package):
+        outer, _, inner = name.partition(".")
+        other = inner.split(".")[0]
+        if outer == PACKAGE and other in ROOMS and room in ROOMS and other not in ROOMS[room] | {room}:
+            found.append(f"{line}: {room} imports {other}")
+        if outer in SIMULATORS and room != "sim":
+            found.append(f"{line}: {outer} outside sim")
+        if outer in LIGHTNING and room in GROUND | {"models", "sim"}:
+            found.append(f"{line}: {outer} in {room}")
+        if outer in ACCOUNTS:
+            found.append(f"{line}: {outer} needs an account")
+    return found
+
+
+def public_definitions(tree: ast.Module) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef]:
+    """Public functions and classes of a file, and the public methods of its public classes."""
+    todo: list[ast.stmt] = list(tree.body)
+    while todo:
+        node = todo.pop()
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)) and not node.name.startswith("_"):
+            yield node
+            if isinstance(node, ast.ClassDef):
+                todo.extend(node.body)
+
+
+def inherits(node: ast.stmt) -> bool:
+    return isinstance(node, ast.ClassDef) and bool(node.bases)
+
+
+@pytest.fixture(params=FILES, ids=lambda path: module_name(path) or PACKAGE)
+def file(request: pytest.FixtureRequest) -> tuple[Path, ast.Module]:
+    return request.param, ast.parse(request.param.read_text(encoding="utf-8"))
+
+
+def test_imports_flow_one_way(file):
+    path, tree = file
+    assert violations(tree, module_name(path), path.name == "__init__.py") == []
+
+
+def test_every_file_belongs_to_a_room(file):
+    path, _ = file
+    assert (module_name(path) or PACKAGE).split(".")[0] in {*ROOMS, PACKAGE}
+
+
+def test_importing_sim_does_not_import_a_simulator(file):
+    """Loading a task class may; listing tasks, probing the renderer and naming seeds works where none is installed."""
+    path, tree = file
+    if path.name == "__init__.py" or module_name(path) == "sim.render":
+        assert imports_at_top_level(tree).isdisjoint(SIMULATORS)
+
+
+def test_files_and_classes_are_named_for_the_noun_they_own(file):
+    path, tree = file
+    assert VAGUE_NAMES.isdisjoint(path.relative_to(SOURCE).with_suffix("").parts)
+    classes = [node.name for node in ast.walk(tree) if isinstance(node, ast.ClassDef)]
+    assert [name for name in classes if name.endswith(VAGUE_SUFFIXES)] == []
+
+
+def test_every_public_name_says_what_it_is(file):
+    """Methods of a subclass may stay silent where the base class, ours or a framework's, defines what they do."""
+    path, tree = file
+    assert ast.get_docstring(tree) or path.name == "__init__.py", "the file has no docstring"
+    overriding = {id(item) for node in ast.walk(tree) if inherits(node) for item in node.body}
+    silent = [
+        f"{node.lineno}: {node.name}"
+        for node in public_definitions(tree)
+        if not ast.get_docstring(node) and id(node) not in overriding
+    ]
+    assert silent == []
+
+
+@pytest.mark.parametrize(
+    ("module", "line", "complaint"),
+    [
+        ("data.chunks", "from ugr_lightning.models.act import ACT", "data imports models"),
+        ("models.act", "import ugr_lightning.sim.robot", "models imports sim"),
+        ("models.act", "import lightning.pytorch as pl", "lightning in models"),
+        ("sim.tasks.click", "from ...rollout import runner", "sim imports rollout"),
+        ("rollout.runner", "from ugr_lightning import training", "rollout imports training"),
+        ("training.module", "import ugr_lightning.cli.main", "training imports cli"),
+        ("rollout.runner", "def f():\n    import sapien.core", "sapien outside sim"),
+        ("training.module", "importlib.import_module('mani_skill.envs')", "mani_skill outside sim"),
+        ("training.callbacks.rollout", "from wandb import init", "wandb needs an account"),
+    ],
+)
+def test_the_rules_notice_a_wrong_import(module, line, complaint):
+    assert any(complaint in found for found in violations(ast.parse(line), module))
+
+
+def test_the_rules_allow_what_the_design_draws():
+    allowed = "from ugr_lightning.contract import Batch\nfrom .formats import robotwin\nimport torch"
+    assert violations(ast.parse(allowed), "data.episode") == []
+    assert violations(ast.parse("from ugr_lightning.sim.simulator import Simulator"), "rollout.runner") == []
+
+
+def test_no_text_of_the_package_asks_for_an_account(file):
+    path, _ = file
+    assert "wandb" not in path.read_text(encoding="utf-8").lower()
+
+
+def test_listing_the_simulation_does_not_load_a_simulator():
+    """Proved by running it, because an import may hide behind another."""
+    program = (
+        "import sys; import ugr_lightning.sim, ugr_lightning.sim.tasks as tasks, ugr_lightning.sim.seeds;"
+        "tasks.task_names(), tasks.task_summaries();"
+        f"sys.exit(', '.join(sorted({SIMULATORS!r} & set(sys.modules))))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
