@@ -1,6 +1,6 @@
 """Motion primitives of the scripted experts: smooth tool paths that become joint commands one control step at a time."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -81,7 +81,9 @@ class Arms:
 
     def __init__(self, command: np.ndarray, speed: float = 1.0) -> None:
         self.speed = speed
-        self.joints: dict[str, Array] = {s: np.array(command[i : i + 6], float) for s, i in zip(SIDES, (0, 7), strict=True)}
+        self.joints: dict[str, Array] = {
+            s: np.array(command[i : i + 6], float) for s, i in zip(SIDES, (0, 7), strict=True)
+        }
         self.opening = {"left": float(command[6]), "right": float(command[13])}
         self._coming: dict[str, list[Array]] = {"left": [], "right": []}  # joints still to be commanded
         self._emitted = 0
@@ -96,7 +98,7 @@ class Arms:
         *,
         steps: int,
         phase: str,
-        slack: tuple[float, float] = (1.0, 1.0),
+        slack: Sequence[float] = (1.0,),
         grip: Mapping[str, float] | None = None,
         overlap: int = 0,
     ) -> Iterator[ExpertStep]:
@@ -109,7 +111,7 @@ class Arms:
             goals: per side a world tool pose, or (6,) joints.
             steps: control steps at speed 1.
             phase: label of the steps.
-            slack: at the first and last step, smooth in between.
+            slack: values at equally spaced moments of the motion, smooth in between.
             grip: per side the opening (0 .. 1) to ramp to over the motion.
             overlap: how many steps before its end the next motion takes over and is added to the rest of this one, so
                 that the arm does not stop in between.
@@ -125,17 +127,17 @@ class Arms:
         for k in range(1, emitted + 1):
             for side, (start, end) in openings.items():
                 self.opening[side] = start + (end - start) * minimum_jerk(k / emitted)
-            yield self._emit(phase, slack[0] + (slack[1] - slack[0]) * minimum_jerk(k / emitted))
+            yield self._emit(phase, _between(slack, k / emitted))
 
     def grip(self, openings: Mapping[str, float], *, steps: int, phase: str) -> Iterator[ExpertStep]:
         """Open or close grippers while the arms hold their pose, and give the fingers a moment to arrive."""
         ramp = max(1, round(0.7 * steps))
-        yield from self.move({}, steps=ramp, phase=phase, slack=(0.0, 0.0), grip=openings)
+        yield from self.move({}, steps=ramp, phase=phase, slack=(0.0,), grip=openings)
         yield from self.hold(steps - ramp, phase=phase)
 
     def hold(self, steps: int, *, phase: str) -> Iterator[ExpertStep]:
         """Keep the last command."""
-        yield from self.move({}, steps=steps, phase=phase, slack=(0.0, 0.0))
+        yield from self.move({}, steps=steps, phase=phase, slack=(0.0,))
 
     def _scaled(self, steps: int) -> int:
         return max(1, round(steps / self.speed))
@@ -166,6 +168,14 @@ class Arms:
         else:
             posture = np.asarray(goal, float)
         return [joints + (posture - end) * minimum_jerk((k + 1) / count) for k, joints in enumerate(before)]
+
+
+def _between(knots: Sequence[float], fraction: float) -> float:
+    """Value at a fraction (0 .. 1) of a smooth curve through equally spaced knots."""
+    place = fraction * (len(knots) - 1)
+    index = min(int(place), max(len(knots) - 2, 0))
+    following = knots[min(index + 1, len(knots) - 1)]
+    return knots[index] + (following - knots[index]) * minimum_jerk(place - index)
 
 
 def _straight_line(before: list[Array], target: TcpPose, start: Array) -> list[Array] | None:

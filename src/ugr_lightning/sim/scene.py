@@ -141,7 +141,7 @@ class TwoArmEnv(BaseEnv):
         links = self.agent.robot.links_map
         wrist = look_at((-0.02, 0.0, 0.11), (0.17, 0.0, 0.0))
         cameras = {
-            "cam_high": (look_at((0.0, -0.62, 0.72), (0.0, 0.06, 0.05)), 58.0, None),
+            "cam_high": (look_at((0.0, -0.55, 0.66), (0.0, -0.01, 0.06)), 50.0, None),
             "cam_right_wrist": (wrist, 70.0, links["right_gripper_link"]),
             "cam_left_wrist": (wrist, 70.0, links["left_gripper_link"]),
         }

@@ -167,7 +167,9 @@ def _add_body(
         sliding = joint.get("type") == "slide"
         limits = _numbers(joint, "range", 2)
         if sliding:  # the package's own range closes the pads into each other
-            limits = np.array([FINGER_CLOSED, FINGER_OPEN]) if limits[0] > 0 else -np.array([FINGER_OPEN, FINGER_CLOSED])
+            limits = (
+                np.array([FINGER_CLOSED, FINGER_OPEN]) if limits[0] > 0 else -np.array([FINGER_OPEN, FINGER_CLOSED])
+            )
         element = _add_joint(
             robot,
             joint.attrib["name"].replace(f"vx300s_{side}/", f"{side}_"),

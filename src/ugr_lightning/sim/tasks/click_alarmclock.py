@@ -19,7 +19,7 @@ X_RANGE = (0.05, 0.25)  # to the left or to the right of the middle
 Y_RANGE = (-0.2, 0.0)
 
 BUTTON_HEIGHT = 0.112  # top of the button above the table
-BUTTON_RADIUS = 0.016
+BUTTON_RADIUS = 0.018
 FINGERTIP = 0.014  # fingertips beyond the TCP
 HOVER = 0.07  # fingertips above the button before they go straight down
 PRESS_DEPTH = 0.012  # commanded below the top, so that a policy's millimetres do not matter
@@ -67,8 +67,8 @@ class ClickAlarmclock(TwoArmEnv):
         rotation = gripper_down(facing(side))
         tip = self.button_point + [0.0, 0.0, FINGERTIP]
         above, pressed = TcpPose(tip + [0.0, 0.0, HOVER], rotation), TcpPose(tip - [0.0, 0.0, PRESS_DEPTH], rotation)
-        yield from arms.move({side: above}, steps=54, phase="reach", slack=(1.0, 1.0), grip={side: 0.0}, overlap=14)
-        yield from arms.move({side: pressed}, steps=44, phase="press", slack=(1.0, 0.0))
+        yield from arms.move({side: above}, steps=54, phase="reach", grip={side: 0.0}, overlap=14)
+        yield from arms.move({side: pressed}, steps=44, phase="press", slack=(1.0, 0.4, 0.0, 0.0))
         yield from arms.hold(8, phase="hold")
 
     def describe(self) -> dict[str, Any]:
