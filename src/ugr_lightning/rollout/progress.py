@@ -36,7 +36,9 @@ class Progress:
         if self._shown and self._stream.isatty():
             columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
             console = Console(file=self._stream)
-            self._bar = Bar(*columns, TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console)
+            self._bar = Bar(
+                *columns, TextColumn("left"), TimeRemainingColumn(), TextColumn("{task.fields[note]}"), console=console
+            )
             self._task = self._bar.add_task(self._title, total=self._total, completed=self._done, note="")
             self._bar.start()
         return self
@@ -46,6 +48,12 @@ class Progress:
     ) -> None:
         if self._bar is not None:
             self._bar.stop()
+
+    def begin(self) -> None:
+        """Start the clock: what went before, such as starting processes, does not enter the estimate."""
+        self._start = self._last_line = time.monotonic()
+        if self._bar is not None:
+            self._bar.reset(self._task, completed=self._done)
 
     def advance(self, note: str = "") -> None:
         """Count one more.

@@ -72,7 +72,7 @@ def summarize(results: Iterable[EpisodeResult]) -> Summary:
 
 
 def success_table(results: Sequence[EpisodeResult]) -> str:
-    """A plain-text table: one row per (task, setting, policy, execution) in order of appearance, n and interval beside every rate."""
+    """A plain-text table, n and interval beside every rate: one row per (task, setting, policy, execution)."""
     groups: dict[tuple[str, str, str, str], list[EpisodeResult]] = {}
     for result in results:
         groups.setdefault((result.task, result.setting, result.policy, result.execution), []).append(result)

@@ -190,3 +190,18 @@ def _end_with_parent(parent: int) -> None:
     while os.getppid() == parent:
         time.sleep(0.5)
     os._exit(1)
+
+
+def open_simulator(simulator: Callable[..., Any] | None, task: str, **settings: Any) -> Any:
+    """Open a simulator in this process.
+
+    Args:
+        simulator: what to call in place of `sim.Simulator`, or None.
+        task: task name.
+        settings: keyword arguments of `sim.Simulator`.
+    """
+    if simulator is None:
+        from ugr_lightning.sim.simulator import Simulator
+
+        simulator = Simulator
+    return simulator(task, **settings)

@@ -1,0 +1,108 @@
+"""Videos of episodes: animated GIF (Pillow) or MP4 (imageio's ffmpeg), pictures side by side, uncertainty below."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+import imageio_ffmpeg
+import numpy as np
+from PIL import Image, ImageDraw
+
+from ugr_lightning.errors import ConfigError
+
+STRIP_HEIGHT = 12
+SUCCESS_COLOUR, TEXT_COLOUR = (40, 170, 70), (255, 255, 255)
+
+
+def compose_frames(
+    images: Sequence[np.ndarray],
+    *,
+    log_variance: Sequence[np.ndarray | None] | None = None,
+    success: Sequence[bool] | None = None,
+    every: int = 1,
+) -> np.ndarray:
+    """Put the cameras of each step side by side and write the step, success and s_k on them.
+
+    Args:
+        images: per step (V, H, W, 3) uint8 RGB.
+        log_variance: per step the s_k (K,) of the newest chunk, None where there is none yet; drawn as a strip below
+            the pictures, k from left to right, dark certain and bright uncertain over the episode's range.
+        success: per step whether the task's condition has been met.
+        every: keep every n-th step; the last one always.
+
+    Returns:
+        (T, H', W', 3) uint8 RGB, the form that TensorBoard's `add_images` takes with `dataformats="NHWC"`.
+    """
+    known = [values for values in log_variance or [] if values is not None]
+    low, high = (min(map(np.min, known)), max(map(np.max, known))) if known else (0.0, 1.0)
+    steps = sorted({*range(0, len(images), every), len(images) - 1})
+    frames = []
+    for step in steps:
+        picture = Image.fromarray(np.concatenate(list(images[step]), axis=1))  # (H, V W, 3)
+        drawing = ImageDraw.Draw(picture)
+        done = bool(success[step]) if success is not None else False
+        drawing.text(
+            (3, 1), f"{step}{'  success' if done else ''}", fill=TEXT_COLOUR, stroke_width=1, stroke_fill=(0, 0, 0)
+        )
+        if done:
+            drawing.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=SUCCESS_COLOUR, width=2)
+        frame = np.asarray(picture)
+        if known and log_variance is not None:
+            frame = np.concatenate([frame, _strip(log_variance[step], frame.shape[1], float(low), float(high))])
+        frames.append(frame)
+    return np.stack(frames)
+
+
+def _strip(values: np.ndarray | None, width: int, low: float, high: float) -> np.ndarray:
+    """(STRIP_HEIGHT, width, 3): one bar per k, dark blue to yellow; grey where nothing has been predicted."""
+    if values is None:
+        return np.full((STRIP_HEIGHT, width, 3), 60, np.uint8)
+    share = np.clip((np.asarray(values, np.float64) - low) / max(high - low, 1e-6), 0, 1)  # (K,)
+    colours = np.stack([30 + 225 * share, 30 + 190 * share, 90 - 60 * share], axis=-1)  # (K, 3)
+    bars = colours[np.arange(width) * len(share) // width]  # (width, 3)
+    return np.broadcast_to(bars, (STRIP_HEIGHT, width, 3)).astype(np.uint8)
+
+
+def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, *, fps: float = 25.0) -> None:
+    """Write frames as `.gif` or `.mp4`, complete or not at all.
+
+    Args:
+        path: the ending decides the format.
+        frames: (H, W, 3) uint8 RGB each.
+        fps: pictures per second of the recording; played at this speed.
+
+    Raises:
+        ConfigError: another ending, or no frames.
+    """
+    path = Path(path)
+    if path.suffix not in (".gif", ".mp4") or not len(frames):
+        got = f"{path.suffix or 'none'} with {len(frames)} frames"
+        raise ConfigError(path, "a video ending in .gif or .mp4 with frames", got, "Change the name's ending.")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f"{path.stem}.partial{path.suffix}")  # the writers look at the ending
+    if path.suffix == ".gif":
+        _write_gif(partial, frames, fps)
+    else:
+        _write_mp4(partial, frames, fps)
+    os.replace(partial, path)
+
+
+def _write_gif(path: Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> None:
+    """One palette for all frames: Pillow then stores only what changes, a third of the size."""
+    sample = np.concatenate(list(frames[:: max(1, len(frames) // 4)]))
+    palette = Image.fromarray(sample).quantize(128, dither=Image.Dither.NONE)
+    pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
+    duration = max(20, round(1000 / fps / 10) * 10)  # GIF counts in hundredths of a second
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=duration, loop=0, optimize=False)
+
+
+def _write_mp4(path: Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> None:
+    height, width = frames[0].shape[:2]
+    size = (width + width % 2, height + height % 2)  # yuv420p wants even sizes
+    writer = imageio_ffmpeg.write_frames(str(path), size, fps=fps, codec="libx264", macro_block_size=1)
+    writer.send(None)
+    try:
+        for frame in frames:
+            writer.send(np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge").tobytes())
+    finally:
+        writer.close()
