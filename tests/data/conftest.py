@@ -18,22 +18,21 @@ def _one_thread():
     torch.set_num_threads(1)
 
 
-def make_images(frames, rng, size=SIZE):
-    """Smooth pictures with a strong, distinct red and blue; (frames, V, H, W, 3)."""
+def _images(frames, rng, size):
+    """Smooth pictures whose red and blue differ; (frames, V, H, W, 3)."""
     base = rng.integers(40, 215, size=(frames, 3, 1, 1, 3))
     ramp = np.linspace(-20, 20, size[1])[:, None] + np.linspace(-15, 15, size[0])[:, None, None]
     return np.clip(base + ramp, 0, 255).astype(np.uint8)
 
 
-def make_episode(steps=12, seed=0, size=SIZE, **changes):
-    """Keyword arguments of `write_episode`."""
+def _arrays(steps=12, seed=0, size=SIZE, **changes):
     rng = np.random.default_rng(seed)
     parameters = {
         camera: {"intrinsic_cv": np.eye(3) * 30, "extrinsic_cv": np.eye(3, 4), "cam2world_gl": np.eye(4)}
         for camera in CAMERAS
     }
     given = {
-        "images": make_images(steps + 1, rng, size),
+        "images": _images(steps + 1, rng, size),
         "commanded": rng.normal(size=(steps + 1, 14)).astype(np.float32),
         "measured": rng.normal(size=(steps + 1, 14)).astype(np.float32),
         "endpose": rng.normal(size=(steps + 1, 2, 7)),
@@ -51,26 +50,37 @@ def make_episode(steps=12, seed=0, size=SIZE, **changes):
     return {**given, **changes}
 
 
-@pytest.fixture
-def episode_file(tmp_path):
-    """One good episode file."""
-    path = episode_path(tmp_path, 0)
-    write_episode(path, **make_episode())
-    return path
-
-
-def record(root: Path, count=5, task="click_alarmclock"):
-    """A recording of `count` episodes of different lengths; returns its folder."""
+def _record(root: Path, count=5, steps=7, task="click_alarmclock"):
     folder = root / task / "demo_clean"
     for index in range(count):
-        write_episode(episode_path(folder, index), **make_episode(steps=7 + 3 * index, seed=index))
+        write_episode(episode_path(folder, index), **_arrays(steps=steps + 3 * index, seed=index))
     write_seeds(folder, range(count))
     return folder
 
 
 @pytest.fixture(scope="session")
+def arrays():
+    """Makes keyword arguments of `write_episode`; changes replace single ones."""
+    return _arrays
+
+
+@pytest.fixture(scope="session")
+def record():
+    """Records `count` episodes of 7, 10, 13, ... steps under a root; returns their folder."""
+    return _record
+
+
+@pytest.fixture
+def episode_file(tmp_path):
+    """One good episode file of 12 steps."""
+    path = episode_path(tmp_path, 0)
+    write_episode(path, **_arrays())
+    return path
+
+
+@pytest.fixture(scope="session")
 def recording_root(tmp_path_factory):
-    """Root folder with five episodes of click_alarmclock; do not change it."""
+    """Root folder with five episodes of click_alarmclock; not to be changed."""
     root = tmp_path_factory.mktemp("recordings")
-    record(root)
+    _record(root)
     return root

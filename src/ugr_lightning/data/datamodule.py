@@ -125,9 +125,9 @@ class ChunkDataModule(lightning.LightningDataModule):
         """
         if len(find_episodes(self.folder)) < self.episodes and self.recorder is not None:
             self.recorder(self)
-        episodes = self._read()
+        self._chosen()
         if self.cache == "memmap":
-            open_frames(episodes, self.cache, self.image_size)
+            open_frames(self._read(), self.cache, self.image_size)
 
     def setup(self, stage: str | None = None) -> None:
         """Check the demonstrations, split them, compute statistics and decode; the second call does nothing."""
@@ -140,14 +140,16 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.data = ChunkDataset(episodes, store, self.chunk_length, self.state, self.action_offset, self.after_end)
         self.demonstrations = episodes
 
-    def _read(self) -> list[Episode]:
+    def _chosen(self) -> dict[int, Path]:
         found = find_episodes(self.folder)
         if len(found) < self.episodes:
             fix = f"Record them with `ugr collect --task {self.task} --episodes {self.episodes}`."
             raise DataError(self.folder, f"{self.episodes} demonstrations", len(found), fix)
+        return dict(list(found.items())[: self.episodes])
+
+    def _read(self) -> list[Episode]:
         seeds = dict(enumerate(read_seeds(self.folder)))
-        chosen = list(found.items())[: self.episodes]
-        return [read_episode(path, self.cameras, seed=seeds.get(index)) for index, path in chosen]
+        return [read_episode(path, self.cameras, seed=seeds.get(index)) for index, path in self._chosen().items()]
 
     @property
     def split(self) -> dict[str, Any]:

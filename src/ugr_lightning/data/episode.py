@@ -64,7 +64,7 @@ class JpegFrames(FrameSource):
         """
         try:
             return tuple(bytes(dataset[step]) for dataset in self._datasets())
-        except (OSError, KeyError, ValueError, IndexError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, IndexError) as error:
             raise DataError(f"{self.path}[{step}]", "a stored frame", f"a read error ({error})", FIX) from error
 
     def read(self, step: int, out: np.ndarray) -> None:

@@ -1,6 +1,5 @@
 """Reading HDF5 files that nobody vouches for: every key is checked before its content is touched."""
 
-import difflib
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -60,9 +59,6 @@ def find_dataset(file: h5py.File, key: str) -> h5py.Dataset:
 
 def _nearby(node: object, part: str) -> str:
     keys = list(node) if isinstance(node, h5py.Group) else []
-    close = difflib.get_close_matches(part, keys, n=1)
-    if close:
-        return f"no '{part}', but '{close[0]}'"
     return f"no '{part}' among {', '.join(keys[:8]) or 'no keys at all'}"
 
 

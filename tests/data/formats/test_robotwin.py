@@ -1,0 +1,310 @@
+"""Demonstration files survive the round trip, and nothing damaged or foreign gets past the reader."""
+
+import io
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.folder import episode_path
+from ugr_lightning.data.formats import robotwin
+from ugr_lightning.data.formats.robotwin import read_episode, write_episode
+from ugr_lightning.data.jpeg import encode_frame, encode_jpeg
+from ugr_lightning.errors import ConfigError, DataError
+
+VECTOR = "joint_action/vector"
+HEAD = "observation/head_camera/rgb"
+
+
+def test_the_numbers_of_an_episode_come_back_exactly(tmp_path, arrays):
+    given = arrays(steps=9, seed=4)
+    write_episode(episode_path(tmp_path, 4), **given)
+    episode = read_episode(episode_path(tmp_path, 4))
+    assert (episode.length, episode.seed, episode.name, episode.image_size) == (9, 4, "episode4", (24, 32))
+    np.testing.assert_array_equal(episode.state, given["commanded"][:-1])
+    np.testing.assert_array_equal(episode.measured, given["measured"][:-1])
+    np.testing.assert_array_equal(episode.action, given["expert_action"])
+    np.testing.assert_array_equal(episode.extras["contacts"], given["contacts"])
+    np.testing.assert_array_equal(episode.extras["slack"], given["slack"])
+    assert episode.extras["phase"] == tuple(given["phase"])
+    assert episode.extras["task"] == "click_alarmclock"
+    assert episode.extras["control_hz"] == 25.0
+
+
+def test_pictures_come_back_in_true_rgb_and_in_the_order_asked_for(tmp_path, arrays):
+    given = arrays(steps=3)
+    write_episode(episode_path(tmp_path, 0), **given)
+    for step in range(3):
+        got = read_episode(episode_path(tmp_path, 0)).images(step).astype(int)
+        assert np.abs(got - given["images"][step]).max() <= 8  # what JPEG at quality 95 costs here
+    swapped = read_episode(episode_path(tmp_path, 0), ("cam_left_wrist", "cam_high")).images(1).astype(int)
+    assert np.abs(swapped - given["images"][1][[2, 0]]).max() <= 8
+
+
+def test_files_have_robotwins_colour_order_for_other_viewers(tmp_path, arrays):
+    images = np.zeros((2, 3, 24, 32, 3), np.uint8)
+    images[..., 0] = 200  # red
+    write_episode(episode_path(tmp_path, 0), **arrays(steps=1, images=images))
+    with h5py.File(episode_path(tmp_path, 0)) as file:
+        seen = np.asarray(Image.open(io.BytesIO(bytes(file[HEAD][0]))))
+    assert seen[12, 16, 2] > 190
+    assert seen[12, 16, 0] < 10
+
+
+def test_jpegs_marked_as_true_rgb_are_not_swapped(tmp_path, arrays):
+    images = np.zeros((3, 24, 32, 3), np.uint8)
+    images[..., 0] = 200
+    marked = []
+    for image in images:
+        jpeg = encode_jpeg(image[..., ::-1])  # true RGB on disk
+        marked.append(jpeg[:2] + b"\xff\xfe\x00\x0aXPL-RGB1" + jpeg[2:])
+    write_episode(episode_path(tmp_path, 0), **arrays(steps=1, images=[marked, marked]))
+    assert read_episode(episode_path(tmp_path, 0)).images(0)[0, 12, 16].tolist()[0] > 190
+
+
+def test_the_layout_on_disk_is_robotwins(episode_file, arrays):
+    given = arrays()
+    with h5py.File(episode_file) as file:
+        assert file[VECTOR].shape == (13, 14)
+        for key in (VECTOR, "joint_action/left_arm", "joint_action/right_gripper", "endpose/left_endpose"):
+            assert file[key].dtype == np.float64, key
+        np.testing.assert_array_equal(file["joint_action/left_arm"], given["commanded"][:, :6])
+        np.testing.assert_array_equal(file["joint_action/left_gripper"], given["commanded"][:, 6])
+        np.testing.assert_array_equal(file["joint_action/right_arm"], given["commanded"][:, 7:13])
+        np.testing.assert_array_equal(file["joint_action/right_gripper"], given["commanded"][:, 13])
+        np.testing.assert_array_equal(file["endpose/right_endpose"], given["endpose"][:, 1])
+        np.testing.assert_array_equal(file["endpose/right_gripper"], given["commanded"][:, 13])
+        assert file["pointcloud"].shape == (13, 0)
+        for camera in ("head_camera", "left_camera", "right_camera"):
+            rgb = file[f"observation/{camera}/rgb"]
+            assert rgb.dtype.kind == "S"
+            assert rgb.dtype.itemsize == max(len(jpeg) for jpeg in rgb[()])
+            assert bytes(rgb[0]).endswith(b"\xff\xd9")
+            assert file[f"observation/{camera}/intrinsic_cv"].shape == (13, 3, 3)
+            assert file[f"observation/{camera}/extrinsic_cv"].shape == (13, 3, 4)
+            assert file[f"observation/{camera}/cam2world_gl"].shape == (13, 4, 4)
+
+
+def test_encoded_frames_are_stored_as_they_are(tmp_path, arrays):
+    given = arrays(steps=2)
+    jpegs = [encode_frame(frame) for frame in given["images"]]
+    write_episode(episode_path(tmp_path, 0), **{**given, "images": jpegs})
+    assert read_episode(episode_path(tmp_path, 0)).frames.encoded(1) == jpegs[1]
+
+
+def test_moving_cameras_keep_their_parameters_of_each_frame(tmp_path, arrays):
+    given = arrays(steps=2)
+    moving = []
+    for frame in range(3):
+        now = {camera: dict(given["camera_parameters"][camera]) for camera in CAMERAS}
+        now["cam_left_wrist"]["extrinsic_cv"] = np.full((3, 4), float(frame))
+        moving.append(now)
+    write_episode(episode_path(tmp_path, 0), **{**given, "camera_parameters": moving})
+    with h5py.File(episode_path(tmp_path, 0)) as file:
+        assert file["observation/left_camera/extrinsic_cv"][:, 0, 0].tolist() == [0, 1, 2]
+
+
+def test_without_an_expert_action_the_label_is_the_next_command(episode_file, arrays):
+    with h5py.File(episode_file, "r+") as file:
+        del file["ugr"]
+        for name in list(file.attrs):
+            del file.attrs[name]
+    episode = read_episode(episode_file, seed=17)
+    np.testing.assert_array_equal(episode.action, arrays()["commanded"][1:])
+    assert (episode.seed, episode.measured, episode.extras) == (17, None, {})
+    with pytest.raises(ConfigError, match="commanded"):
+        episode.proprioception("measured")
+
+
+def test_a_failure_while_writing_leaves_no_file_and_keeps_the_old_one(tmp_path, arrays, monkeypatch):
+    path = episode_path(tmp_path, 0)
+    write_episode(path, **arrays(seed=1))
+    before = path.read_bytes()
+
+    def fail(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(robotwin, "_write_robot", fail)
+    for target in (path, episode_path(tmp_path, 1)):
+        with pytest.raises(KeyboardInterrupt):
+            write_episode(target, **arrays(seed=2))
+    assert path.read_bytes() == before
+    assert not episode_path(tmp_path, 1).exists()
+
+
+WRONG_ARGUMENTS = {
+    "commanded": np.zeros((13, 13)),
+    "measured": np.zeros((12, 14)),
+    "endpose": np.full((13, 2, 7), np.nan),
+    "contacts": np.zeros((13,), bool),
+    "expert_action": np.full((12, 14), np.inf),
+    "phase": ["reach"],
+    "slack": np.zeros(13),
+    "images": np.zeros((13, 3, 24, 32, 3), np.float32),
+    "camera_parameters": [],
+}
+
+
+@pytest.mark.parametrize("name", WRONG_ARGUMENTS)
+def test_wrong_arguments_are_refused_before_anything_is_written(name, tmp_path, arrays):
+    with pytest.raises(DataError, match=name):
+        write_episode(episode_path(tmp_path, 0), **arrays(**{name: WRONG_ARGUMENTS[name]}))
+    assert not list(tmp_path.rglob("*.*"))
+
+
+def _replace(key, values, **options):
+    def damage(file):
+        del file[key]
+        file.create_dataset(key, data=values, **options)
+
+    return damage
+
+
+def _poke(key, where, value):
+    def damage(file):
+        file[key][where] = value
+
+    return damage
+
+
+def _declare(key, shape, dtype):
+    def damage(file):
+        del file[key]
+        file.create_dataset(key, shape, dtype, chunks=(1, *shape[1:]))
+
+    return damage
+
+
+def _link(key, link):
+    def damage(file):
+        del file[key]
+        file[key] = link
+
+    return damage
+
+
+def _external_storage(file):
+    del file[VECTOR]
+    file.create_dataset(VECTOR, (13, 14), np.float64, external=[("/dev/zero", 0, 13 * 14 * 8)])
+
+
+def _virtual(file):
+    del file[VECTOR]
+    layout = h5py.VirtualLayout((13, 14), np.float64)
+    layout[:] = h5py.VirtualSource("elsewhere.hdf5", "x", (13, 14))
+    file.create_virtual_dataset(VECTOR, layout)
+
+
+def _other_size(file):
+    del file[HEAD]
+    file[HEAD] = np.array([encode_jpeg(np.zeros((16, 16, 3), np.uint8))] * 13)
+
+
+def _one_other_size(file):
+    file[HEAD][5] = encode_jpeg(np.zeros((16, 16, 3), np.uint8))
+
+
+def _group_instead(file):
+    del file[VECTOR]
+    file.create_group(VECTOR)
+
+
+HOSTILE = {
+    "vector missing": (lambda file: file.pop(VECTOR), f"{VECTOR}.*left_arm"),
+    "vector renamed": (lambda file: file.move(VECTOR, "joint_action/vektor"), f"{VECTOR}.*vektor"),
+    "vector a group": (_group_instead, f"{VECTOR}.*group"),
+    "vector of integers": (_replace(VECTOR, np.zeros((13, 14), int)), f"{VECTOR}.*int64"),
+    "vector of strings": (_replace(VECTOR, np.full((13, 14), b"0.5")), f"{VECTOR}.*S3"),
+    "vector of 7-joint arms": (_replace(VECTOR, np.zeros((13, 16))), VECTOR + r".*\(T, 14\).*\(13, 16\)"),
+    "vector flat": (_replace(VECTOR, np.zeros(13 * 14)), VECTOR + r".*\(182,\)"),
+    "vector a scalar": (_replace(VECTOR, 1.0), VECTOR + r".*\(\)"),
+    "vector without content": (_replace(VECTOR, h5py.Empty("f8")), f"{VECTOR}.*None"),
+    "no frames": (_replace(VECTOR, np.zeros((0, 14))), f"{VECTOR}.*at least 2 frames, got 0"),
+    "one frame": (_replace(VECTOR, np.zeros((1, 14))), f"{VECTOR}.*at least 2 frames, got 1"),
+    "other number of frames": (_replace(VECTOR, np.zeros((12, 14))), "expert_action|head_camera"),
+    "NaN": (_poke(VECTOR, (3, 7), np.nan), VECTOR + r".*finite.*nan at \[3, 7\]"),
+    "infinity": (_poke(VECTOR, (0, 0), -np.inf), VECTOR + r".*-inf at \[0, 0\]"),
+    "beyond float32": (_poke(VECTOR, (12, 13), 1e300), VECTOR + r".*inf at \[12, 13\]"),
+    "absurd length": (_declare(VECTOR, (10**12, 14), np.float64), f"{VECTOR}.*at most 100000 frames"),
+    "absurd chunk": (_replace(VECTOR, np.zeros((13, 14)), chunks=(10**6, 14), maxshape=(None, 14)), f"{VECTOR}.*chunk"),
+    "soft link": (_link(VECTOR, h5py.SoftLink("/joint_action/left_arm")), f"{VECTOR}.*link at 'vector'"),
+    "external link": (_link(VECTOR, h5py.ExternalLink("/etc/passwd", "x")), f"{VECTOR}.*link at 'vector'"),
+    "external link to a group": (_link("joint_action", h5py.ExternalLink("o.hdf5", "/")), "link at 'joint_action'"),
+    "external storage": (_external_storage, f"{VECTOR}.*another file"),
+    "virtual dataset": (_virtual, f"{VECTOR}.*another file"),
+    "camera missing": (lambda file: file.pop("observation/head_camera"), "head_camera.*among"),
+    "pictures missing": (lambda file: file.pop(HEAD), f"{HEAD}.*no 'rgb'"),
+    "pictures raw": (_replace(HEAD, np.zeros((13, 24, 32, 3), np.uint8)), HEAD + r".*\(13, 24, 32, 3\)"),
+    "pictures as numbers": (_replace(HEAD, np.zeros(13)), f"{HEAD}.*JPEG bytes.*float64"),
+    "pictures of absurd size": (_declare(HEAD, (13,), "S300000000"), f"{HEAD}.*rows of at most"),
+    "one picture short": (_replace(HEAD, np.array([b"x"] * 12)), HEAD + r".*\(13,\).*\(12,\)"),
+    "no JPEG": (_poke(HEAD, 4, b"GIF89a"), HEAD + r"\[4\].*JPEG"),
+    "empty picture": (_poke(HEAD, 12, b""), HEAD + r"\[12\].*JPEG"),
+    "JPEG markers around nothing": (_poke(HEAD, 0, b"\xff\xd8junk\xff\xd9"), HEAD + r"\[0\].*JPEG"),
+    "a picture of another size": (_one_other_size, HEAD + r"\[5\].*\(24, 32\).*\(16, 16\)"),
+    "cameras of different sizes": (_other_size, "cameras of one size"),
+    "expert action too long": (_replace("ugr/expert_action", np.zeros((13, 14))), "expert_action.*12"),
+    "NaN in expert action": (_poke("ugr/expert_action", (1, 1), np.nan), "expert_action.*finite"),
+    "measured of another length": (_replace("ugr/measured", np.zeros((12, 14))), "measured.*13"),
+    "contacts as numbers": (_replace("ugr/contacts", np.zeros((13, 2))), "contacts.*booleans"),
+    "phases as numbers": (_replace("ugr/phase", np.zeros(12)), "phase.*strings"),
+    "link to measured": (_link("ugr/measured", h5py.ExternalLink("o.hdf5", "x")), "link at 'measured'"),
+    "seed no number": (lambda file: file.attrs.__setitem__("seed", "many"), "@seed.*int.*many"),
+    "format of the future": (lambda file: file.attrs.__setitem__("ugr_format_version", 99), "version 99.*Update"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_damaged_and_foreign_content_is_one_clear_error(case, episode_file):
+    damage, message = HOSTILE[case]
+    with h5py.File(episode_file, "r+") as file:
+        damage(file)
+    with pytest.raises(DataError, match=message) as caught:
+        read_episode(episode_file)
+    assert str(episode_file) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+CONTENT = {
+    "empty file": lambda good: b"",
+    "text": lambda good: b"not hdf5 at all" * 100,
+    "cut in half": lambda good: good[: len(good) // 2],
+    "last bytes missing": lambda good: good[:-100],
+    "only the signature": lambda good: good[:8] + b"\0" * 5000,
+}
+
+
+@pytest.mark.parametrize("case", CONTENT)
+def test_files_that_are_not_whole_hdf5_files_are_refused(case, episode_file):
+    episode_file.write_bytes(CONTENT[case](episode_file.read_bytes()))
+    with pytest.raises(DataError, match=r"episode0\.hdf5.*HDF5"):
+        read_episode(episode_file)
+
+
+def test_overwritten_bytes_never_give_anything_but_a_data_error(episode_file):
+    good = episode_file.read_bytes()
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        damaged = bytearray(good)
+        at = int(rng.integers(0, len(good) - 64))
+        damaged[at : at + 64] = rng.bytes(64)
+        episode_file.write_bytes(damaged)
+        try:
+            episode = read_episode(episode_file)
+            for step in range(episode.length):
+                episode.images(step)
+        except DataError:
+            pass
+
+
+def test_a_missing_file_says_so(tmp_path):
+    with pytest.raises(DataError, match=r"no such file.*ugr collect"):
+        read_episode(tmp_path / "episode0.hdf5")
+
+
+@pytest.mark.parametrize("cameras", [("cam_top",), (), ("head_camera",)])
+def test_unknown_cameras_name_the_known_ones(cameras, episode_file):
+    with pytest.raises(ConfigError, match="cam_high"):
+        read_episode(episode_file, cameras)
