@@ -308,7 +308,7 @@ class ACT(ChunkPolicy):
         pixels = images.flatten(0, 1).contiguous(memory_format=torch.channels_last)  # (B V, 3, H, W)
         if self.training and self.image_shift:
             pixels = shift_images(pixels, self.image_shift)
-        pixels = self.backbone.normalise(pixels)
+        pixels = self.backbone.prepare(pixels)
         if self.training and self.color_jitter:
             pixels = jitter_colour(pixels, self.color_jitter, cameras)
         middle, last = self.backbone(pixels)

@@ -38,26 +38,74 @@ class Attention(nn.Module):
             (B, Q, D).
         """
         dim = query.shape[-1]
-        weight, bias = self.in_proj_weight, self.in_proj_bias
         if query is key:
-            q, k = functional.linear(query, weight[: 2 * dim], bias[: 2 * dim]).chunk(2, dim=-1)  # (B, Q, D) twice
+            (w_qk, w_v), (b_qk, b_v) = (p.split((2 * dim, dim)) for p in (self.in_proj_weight, self.in_proj_bias))
+            q, k = functional.linear(query, w_qk, b_qk).chunk(2, dim=-1)  # (B, Q, D) twice
         else:
-            q = functional.linear(query, weight[:dim], bias[:dim])  # (B, Q, D)
-            k = functional.linear(key, weight[dim : 2 * dim], bias[dim : 2 * dim])  # (B, N, D)
-        v = functional.linear(value, weight[2 * dim :], bias[2 * dim :])  # (B, N, D)
+            (w_q, w_k, w_v), (b_q, b_k, b_v) = (p.chunk(3) for p in (self.in_proj_weight, self.in_proj_bias))
+            q, k = functional.linear(query, w_q, b_q), functional.linear(key, w_k, b_k)  # (B, Q, D), (B, N, D)
+        v = functional.linear(value, w_v, b_v)  # (B, N, D)
         q, k, v = (x.unflatten(-1, (self.heads, -1)).transpose(1, 2) for x in (q, k, v))  # (B, heads, Q or N, D/heads)
         mixed = attend(q, k, v, allowed, self.dropout if self.training else 0.0)  # (B, heads, Q, D/heads)
         projected: Tensor = self.out_proj(mixed.transpose(1, 2).flatten(2))  # (B, Q, D)
         return projected
 
 
-def attend(q: Tensor, k: Tensor, v: Tensor, allowed: Tensor | None, dropout: float) -> Tensor:
-    """Softmax attention of (B, heads, Q, d) queries over (B, heads, N, d) keys and values."""
+def attend(q: Tensor, k: Tensor, v: Tensor, allowed: Tensor | None, probability: float) -> Tensor:
+    """Softmax attention of (B, heads, Q, d) queries over (B, heads, N, d) keys and values.
+
+    On a CPU the plain product is faster than the fused kernel at every length that ACT meets. Forward and backward in
+    bf16 on one AVX512-BF16 core, plain against fused: 65 tokens 6 and 19 ms, 242 tokens 27 and 49 ms, with dropout 47
+    and 102 ms; 902 tokens 410 and 473 ms, with dropout 843 and 2454 ms.
+
+    Args:
+        q, k, v: see above.
+        allowed: bool, broadcastable to (B, heads, Q, N); None for all.
+        probability: of dropping an attention weight.
+
+    Returns:
+        (B, heads, Q, d).
+    """
+    if q.device.type != "cpu":
+        return functional.scaled_dot_product_attention(q, k, v, allowed, probability)
     scores = (q * q.shape[-1] ** -0.5) @ k.transpose(-1, -2)  # (B, heads, Q, N)
     if allowed is not None:
         scores = scores.masked_fill(~allowed, -torch.inf)
-    weights = functional.dropout(scores.softmax(-1), dropout)
-    return weights @ v
+    return drop(scores.softmax(-1), probability) @ v
+
+
+def drop(x: Tensor, probability: float) -> Tensor:
+    """Dropout: zero a share of the values, drawn by chance, and scale up the rest.
+
+    On a CPU `torch.dropout` draws one number a value, a quarter of a training step at the paper's sizes. Here one
+    64-bit number decides four values, to a 65536th, and the mask is written in the type it is multiplied in: four
+    times faster.
+    """
+    if probability == 0:
+        return x
+    if x.device.type != "cpu":
+        return functional.dropout(x, probability)
+    bits = torch.empty((x.numel() + 3) // 4, dtype=torch.int64).random_(-(2**63), None)  # None: all 64 bits
+    bits = bits.view(torch.int16)[: x.numel()].view(x.shape)
+    keep = torch.empty(x.shape, dtype=x.dtype)
+    torch.ge(bits, round(probability * 2**16) - 2**15, out=keep)
+    return x * keep * (1 / (1 - probability))
+
+
+class Dropout(nn.Module):
+    """`drop` in training, nothing in evaluation.
+
+    Args:
+        probability: share of values that are zeroed.
+    """
+
+    def __init__(self, probability: float) -> None:
+        super().__init__()
+        self.probability = probability
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Any shape to the same shape."""
+        return drop(x, self.probability if self.training else 0.0)
 
 
 class EncoderLayer(nn.Module):
@@ -74,7 +122,7 @@ class EncoderLayer(nn.Module):
         self.self_attn = Attention(dim, heads, dropout)
         self.linear1, self.linear2 = nn.Linear(dim, feedforward), nn.Linear(feedforward, dim)
         self.norm1, self.norm2 = nn.LayerNorm(dim), nn.LayerNorm(dim)
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def forward(self, x: Tensor, position: Tensor, allowed: Tensor | None = None) -> Tensor:
         """(B, N, D) to (B, N, D); `position` is (N, D), `allowed` as in `Attention`."""
@@ -98,7 +146,7 @@ class DecoderLayer(nn.Module):
         self.multihead_attn = Attention(dim, heads, dropout)
         self.linear1, self.linear2 = nn.Linear(dim, feedforward), nn.Linear(feedforward, dim)
         self.norm1, self.norm2, self.norm3 = (nn.LayerNorm(dim) for _ in range(3))
-        self.dropout = nn.Dropout(dropout)
+        self.dropout = Dropout(dropout)
 
     def forward(
         self, x: Tensor, position: Tensor, memory: Tensor, memory_keys: Tensor, allowed: Tensor | None = None

@@ -15,6 +15,7 @@ StemName = Literal["standard", "unshuffle"]
 
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
+FOLD = 4  # side of the square of pixels that the unshuffle stem folds into channels
 _PREFIXES = ("", "backbones.0.0.body.", "model.backbones.0.0.body.", "backbone.", "model.backbone.", "policy.backbone.")
 
 
@@ -111,9 +112,13 @@ class ResNet18(nn.Module):
     Source: FACTS 3.2, LEARNING_NOTES (normalisation of a backbone trained from scratch).
     """
 
+    layer1: nn.Sequential
+    layer2: nn.Sequential
+    layer3: nn.Sequential
+    layer4: nn.Sequential
     pretrained: Tensor
-    pixel_mean: Tensor
-    pixel_std: Tensor
+    pixel_scale: Tensor
+    pixel_shift: Tensor
 
     def __init__(
         self,
@@ -126,63 +131,67 @@ class ResNet18(nn.Module):
         if stride not in (16, 32):
             raise ConfigError("backbone_stride", "16 or 32", stride, "Choose one of the two.")
         self.stem, self.norm = stem, norm
-        first = (
-            nn.Conv2d(3, width, 7, 2, 3, bias=False)
-            if stem == "standard"
-            else nn.Conv2d(48, width, 3, 1, 1, bias=False)
-        )
-        self.conv1 = first
+        if stem == "standard":
+            self.conv1 = nn.Conv2d(3, width, 7, 2, 3, bias=False)
+        else:
+            self.conv1 = nn.Conv2d(3 * FOLD * FOLD, width, 3, 1, 1, bias=False)
         self.bn1 = make_norm(norm, width)
         strides = (1, 2, 2, 2 if stride == 32 else 1)
         inputs = width
         for stage, step in enumerate(strides, start=1):
             outputs = width << (stage - 1)
             blocks = BasicBlock(inputs, outputs, step, norm), BasicBlock(outputs, outputs, 1, norm)
-            setattr(self, f"layer{stage}", nn.Sequential(*blocks))
+            self.add_module(f"layer{stage}", nn.Sequential(*blocks))
             inputs = outputs
         self.channels, self.middle_channels = width * 8, width * 4
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
+                module.weight.data = module.weight.data.contiguous(memory_format=torch.channels_last)
         self.register_buffer("pretrained", torch.tensor(False))
         mean, std = (255 * torch.tensor(v).view(1, 3, 1, 1) for v in (IMAGENET_MEAN, IMAGENET_STD))
-        self.register_buffer("pixel_mean", mean, persistent=False)
-        self.register_buffer("pixel_std", std, persistent=False)
-        self.to(memory_format=torch.channels_last)
+        copies = (1, self.conv1.in_channels // 3, 1, 1)
+        self.register_buffer("pixel_scale", (1 / std).repeat(copies), persistent=False)
+        self.register_buffer("pixel_shift", (-mean / std).repeat(copies), persistent=False)
 
-    def normalise(self, images: Tensor) -> Tensor:
-        """Pixels to the scale the network is fed with.
+    def prepare(self, images: Tensor) -> Tensor:
+        """Pixels as the first convolution wants them: folded where the stem folds, and normalised.
 
         Args:
-            images: (n, 3, H, W) uint8 RGB, 0 .. 255, any memory order.
+            images: (n, 3, H, W) uint8 RGB, 0 .. 255; channels last in memory costs no copy.
 
         Returns:
-            (n, 3, H, W) float32, zero mean and unit variance over ImageNet, channels last in memory.
+            (n, 3, H, W) or (n, 48, H/4, W/4) float32, zero mean and unit variance over ImageNet, channels last.
+
+        Raises:
+            ConfigError: an image size that the stem cannot fold.
         """
-        images = images.contiguous(memory_format=torch.channels_last)  # while it is one byte a value
-        return (images.float() - self.pixel_mean) / self.pixel_std  # (n, 3, H, W)
+        pixels = images.permute(0, 2, 3, 1)  # (n, H, W, 3)
+        if self.stem == "unshuffle":  # while a value is one byte
+            height, width = pixels.shape[1:3]
+            if height % FOLD or width % FOLD:
+                fix = "Change the image size, or use `backbone_stem: standard`."
+                raise ConfigError("backbone_stem: unshuffle", f"multiples of {FOLD}", f"{height} x {width}", fix)
+            pixels = pixels.unflatten(2, (-1, FOLD)).unflatten(1, (-1, FOLD))  # (n, H/4, 4, W/4, 4, 3)
+            pixels = pixels.transpose(2, 3).flatten(3)  # (n, H/4, W/4, 48)
+        x = pixels.contiguous().permute(0, 3, 1, 2).float()  # (n, 3 or 48, ...)
+        return torch.addcmul(self.pixel_shift, x, self.pixel_scale)
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of normalised images.
+        """Features of prepared images.
 
         Args:
-            x: (n, 3, H, W) float, normalised.
+            x: (n, 3 or 48, ...) float, from `prepare`.
 
         Returns:
             (n, 4 width, H/16, W/16) features of the third stage and (n, 8 width, H/stride, W/stride) of the last.
 
         Raises:
-            ConfigError: frozen normalisation without trained weights, or an image size the stem cannot fold.
+            ConfigError: frozen normalisation without trained weights.
         """
         if self.norm == "frozen" and not self.pretrained:
             fix = "Give `backbone_weights` a ResNet-18 file, or train from scratch with `backbone_norm: batch`."
             raise ConfigError("backbone_norm: frozen", "trained weights", "random ones", fix)
-        if self.stem == "unshuffle":
-            height, width = x.shape[2:]
-            if height % 4 or width % 4:
-                fix = "Change the image size, or use `backbone_stem: standard`."
-                raise ConfigError("backbone_stem: unshuffle", "multiples of 4 pixels", f"{height} x {width}", fix)
-            x = functional.pixel_unshuffle(x, 4).contiguous(memory_format=torch.channels_last)  # (n, 48, H/4, W/4)
         x = functional.relu(convolve(x, self.conv1, self.bn1), inplace=True)  # (n, width, H/2 or H/4, ...)
         if self.stem == "standard":
             x = functional.max_pool2d(x, 3, 2, 1)  # (n, width, H/4, W/4)

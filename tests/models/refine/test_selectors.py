@@ -1,0 +1,156 @@
+"""The contract of every selector that is found in the package, and what each of them adds."""
+
+import importlib
+import inspect
+import pkgutil
+
+import pytest
+import torch
+
+from ugr_lightning.blueprint import rebuild
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.models import refine
+from ugr_lightning.models.refine.block import Block
+from ugr_lightning.models.refine.full import Full
+from ugr_lightning.models.refine.selector import Selector
+from ugr_lightning.models.refine.uncertainty import Uncertainty
+
+STEPS = 50
+
+
+def discovered() -> list[type[Selector]]:
+    found = []
+    for module in pkgutil.iter_modules(refine.__path__, refine.__name__ + "."):
+        for _, item in inspect.getmembers(importlib.import_module(module.name), inspect.isclass):
+            if issubclass(item, Selector) and not inspect.isabstract(item) and item.__module__ == module.name:
+                found.append(item)
+    return found
+
+
+every_selector = pytest.mark.parametrize("kind", discovered(), ids=lambda kind: kind.__name__)
+
+
+def scores(batch: int = 6) -> torch.Tensor:
+    return torch.randn(batch, STEPS, generator=torch.Generator().manual_seed(0))
+
+
+def whole(batch: int = 6) -> torch.Tensor:
+    return torch.ones(batch, STEPS, dtype=torch.bool)
+
+
+def test_the_selectors_of_the_paper_are_discovered():
+    assert {Full, Block, Uncertainty} <= set(discovered())
+
+
+@every_selector
+@pytest.mark.parametrize("training", [False, True])
+def test_spends_exactly_its_budget_on_a_whole_chunk(kind, training):
+    selector = kind()
+    mask = selector.select(scores(), whole(), training)
+    assert mask.shape == (6, STEPS)
+    assert mask.dtype == torch.bool
+    budget = selector.budget(STEPS)
+    if budget is not None:
+        assert mask.sum(1).tolist() == [budget] * 6
+
+
+@every_selector
+@pytest.mark.parametrize("training", [False, True])
+def test_never_chooses_a_padded_step(kind, training):
+    valid = torch.arange(STEPS)[None] < torch.tensor([50, 40, 20, 14, 3, 1])[:, None]
+    for _ in range(20):
+        assert not (kind().select(scores(), valid, training) & ~valid).any()
+
+
+@every_selector
+def test_is_deterministic_at_run_time_and_leaves_the_random_state_alone(kind):
+    selector, state = kind(), torch.get_rng_state()
+    first = selector.select(scores(), whole(), False)
+    assert torch.equal(state, torch.get_rng_state())
+    assert torch.equal(first, selector.select(scores(), whole(), False))
+
+
+@every_selector
+def test_chooses_for_each_sample_by_itself_at_run_time(kind):
+    selector = kind()
+    together = selector.select(scores(), whole(), False)
+    alone = torch.cat([selector.select(s[None], whole(1), False) for s in scores()])
+    assert torch.equal(together, alone)
+
+
+@every_selector
+def test_does_not_change_its_inputs(kind):
+    log_variance, valid = scores(), whole()
+    kind().select(log_variance, valid, True)
+    assert torch.equal(log_variance, scores())
+    assert torch.equal(valid, whole())
+
+
+@every_selector
+def test_works_without_log_variance_unless_it_says_it_needs_it(kind):
+    if kind.needs_uncertainty:
+        with pytest.raises(ConfigError):
+            kind().select(None, whole(), False)
+    else:
+        assert kind().select(None, whole(), False).shape == (6, STEPS)
+
+
+@every_selector
+def test_is_rebuilt_from_its_blueprint(kind):
+    again = rebuild(kind().blueprint())
+    assert type(again) is kind
+    assert torch.equal(again.select(scores(), whole(), False), kind().select(scores(), whole(), False))
+
+
+def test_full_chooses_all_valid_steps():
+    assert Full().select(None, whole(), True).all()
+
+
+def test_block_is_one_run_in_the_middle_at_run_time():
+    mask = Block(12).select(None, whole(1), False)[0]
+    assert mask.nonzero().flatten().tolist() == list(range(19, 31))
+
+
+def test_block_starts_anywhere_in_training_and_differs_between_samples():
+    mask = Block(12).select(None, whole(4000), True)
+    first = mask.int().argmax(1)
+    assert mask.sum(1).eq(12).all()
+    assert (mask.int().diff(dim=1) == 1).sum(1).le(1).all()  # one run
+    assert first.unique().tolist() == list(range(39))
+    assert first.bincount().min() > 50  # uniform would be 103 each
+
+
+def test_block_longer_than_the_chunk_is_refused():
+    with pytest.raises(ConfigError, match="chunk"):
+        Block(51).budget(50)
+
+
+def test_uncertainty_chooses_fifteen_of_fifty_and_they_are_the_highest():
+    mask = Uncertainty().select(scores(), whole(), False)
+    assert mask.sum(1).tolist() == [15] * 6
+    for row, chosen in zip(scores(), mask, strict=True):
+        assert row[chosen].min() > row[~chosen].max()
+
+
+def test_uncertainty_breaks_ties_towards_earlier_steps():
+    log_variance = torch.zeros(1, STEPS)
+    log_variance[0, 40] = 1
+    chosen = Uncertainty().select(log_variance, whole(1), False)[0].nonzero().flatten().tolist()
+    assert chosen == [*range(14), 40]
+
+
+def test_uncertainty_spends_its_budget_on_valid_steps_even_if_padded_ones_score_higher():
+    valid = torch.arange(STEPS)[None] < 30
+    chosen = Uncertainty().select(torch.arange(STEPS).float()[None], valid, True)[0].nonzero().flatten().tolist()
+    assert chosen == list(range(15, 30))
+
+
+@pytest.mark.parametrize("ratio", [0, -0.1, 1.1])
+def test_a_ratio_that_is_no_share_is_refused(ratio):
+    with pytest.raises(ConfigError, match="ratio"):
+        Uncertainty(ratio)
+
+
+def test_a_ratio_that_selects_nothing_is_refused():
+    with pytest.raises(ConfigError, match="at least one"):
+        Uncertainty(0.01).budget(50)
