@@ -3,6 +3,7 @@
 import argparse
 import logging
 import os
+import re
 import sys
 import warnings
 from collections.abc import Sequence
@@ -12,18 +13,19 @@ from typing import Any
 import torch
 from lightning.pytorch import Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 
 from ugr_lightning.cli.config import expand_includes, explain, run_name
-from ugr_lightning.cli.runs import next_version, resolve_checkpoint, versions_of
+from ugr_lightning.cli.runs import next_version, resolve_checkpoint
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.errors import CheckpointError, UGRError
 from ugr_lightning.training.callbacks.averaging import WeightAverage
 from ugr_lightning.training.callbacks.checkpoints import PolicyCheckpoints
 from ugr_lightning.training.callbacks.figures import ValidationFigures
+from ugr_lightning.training.callbacks.progress import TrainingProgress
 from ugr_lightning.training.callbacks.rng import CounterSeeds
 from ugr_lightning.training.callbacks.rollout import RolloutEvaluation
-from ugr_lightning.training.checkpoint import AtomicCheckpointIO
+from ugr_lightning.training.checkpoint import AtomicCheckpointIO, read_checkpoint
+from ugr_lightning.training.loggers import run_loggers
 from ugr_lightning.training.module import PolicyModule
 
 _RUN_FOLDER = "UGR_RUN_FOLDER"  # tells the other processes of a distributed run which folder the first one chose
@@ -98,27 +100,23 @@ class UGRCLI(LightningCLI):
         """The trainer with both loggers in the run's folder and atomic checkpoints."""
         config = self._get(self.config_init, "trainer")
         if config.get("logger") is None:
-            kwargs["logger"] = self._loggers(self._run_folder(config))
+            kwargs["logger"] = run_loggers(*self._run_folder(config))
         kwargs["plugins"] = [*_listed(config.get("plugins")), AtomicCheckpointIO()]
-        config["callbacks"] = [*_listed(config.get("callbacks")), CounterSeeds(self._get(self.config, "seed_everything"))]
+        always = [CounterSeeds(self._get(self.config, "seed_everything"))]
+        if config.get("enable_progress_bar") is not False:
+            always.append(TrainingProgress())
+        config["callbacks"] = [*_listed(config.get("callbacks")), *always]
         return super().instantiate_trainer(**kwargs)
 
-    def _run_folder(self, trainer_config: Any) -> Path:
-        """A new `version_N`, or the folder of the checkpoint when a fit goes on from its own `last.ckpt`."""
-        if _RUN_FOLDER in os.environ and int(os.environ.get("LOCAL_RANK", "0")) > 0:
-            return Path(os.environ[_RUN_FOLDER])
-        checkpoint = self._get(self.config, "ckpt_path")
+    def _run_folder(self, trainer_config: Any) -> tuple[Path, int | None]:
+        """A new `version_N`; or the checkpoint's own folder, with its step, when a fit goes on from a run's checkpoint."""
         home = Path(trainer_config["default_root_dir"]) / self._get(self.config, "run")
-        if self.subcommand == "fit" and checkpoint and Path(checkpoint).parent in versions_of(Path(checkpoint).parents[1]):
-            folder = Path(checkpoint).parent
-        else:
-            folder = home / f"version_{next_version(home)}"
-        os.environ[_RUN_FOLDER] = str(folder)
-        return folder
-
-    def _loggers(self, folder: Path) -> list[Any]:
-        where: dict[str, Any] = {"save_dir": str(folder.parents[1]), "name": folder.parent.name, "version": folder.name}
-        return [TensorBoardLogger(default_hp_metric=False, **where), CSVLogger(**where)]
+        checkpoint = Path(self._get(self.config, "ckpt_path") or "none")
+        if self.subcommand == "fit" and re.fullmatch(r"version_\d+", checkpoint.parent.name):
+            return checkpoint.parent, int(read_checkpoint(checkpoint)["global_step"])
+        if int(os.environ.get("LOCAL_RANK", "0")) == 0:
+            os.environ[_RUN_FOLDER] = str(home / f"version_{next_version(home)}")
+        return Path(os.environ[_RUN_FOLDER]), None
 
     def after_instantiate_classes(self) -> None:
         """Let the data module record what is missing, with the simulator's help."""
@@ -149,7 +147,10 @@ def run(command: str, argv: Sequence[str]) -> int:
     """
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
-    logging.getLogger("lightning.pytorch.utilities.rank_zero").addFilter(lambda record: "💡" not in record.getMessage())
+    warnings.filterwarnings("ignore", message=".*exists and is not empty.*")  # the log of a resumed run; it is continued
+    warnings.filterwarnings("ignore", message=".*will save all targets and predictions in the buffer.*")
+    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
+    logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     torch.set_num_threads(max(1, len(os.sched_getaffinity(0))) if "OMP_NUM_THREADS" not in os.environ else torch.get_num_threads())
     try:
         UGRCLI([command, *expand_includes(argv)], run_name(argv))

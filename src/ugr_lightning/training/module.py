@@ -54,12 +54,17 @@ class PolicyModule(LightningModule):
         if stage == "fit":
             self.policy.set_statistics(statistics)
 
+    def on_train_epoch_start(self) -> None:
+        """Count logged steps right: Lightning adds one too many when it resumes at an epoch's boundary."""
+        self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.trainer.global_step
+
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
         """The objective of one batch; every named term goes to the log."""
         terms = self.policy.losses(batch)
         if not all(bool(torch.isfinite(term)) for term in terms.values()):
             raise self._not_finite(batch, terms)
         self.log_dict({f"train/{name}": term.detach() for name, term in terms.items()}, batch_size=len(batch.state))
+        self.log("train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=1)
         return terms["loss"]
 
     def validation_step(self, batch: Batch, batch_idx: int) -> None:

@@ -2,6 +2,7 @@
 
 import math
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ class PolicyCheckpoints(Checkpoint):
             return
         better = [name for name, key, sign in self._rules() if self._improves(trainer, name, key, sign)]
         folder = Path(trainer.log_dir or trainer.default_root_dir)
-        trainer.save_checkpoint(folder / LAST)
+        trainer.save_checkpoint(folder / LAST, weights_only=False)  # with the optimiser's state
         self._validated = False
         if trainer.is_global_zero:
             for name in better:
@@ -68,5 +69,8 @@ def _link(source: Path, target: Path) -> None:
     """Let `target` be the same file, replacing what was there in one step."""
     aside = target.with_name(target.name + ".partial")
     aside.unlink(missing_ok=True)
-    os.link(source, aside)  # `last.ckpt` is always replaced, never rewritten, so a link to it is a copy
+    try:
+        os.link(source, aside)  # `last.ckpt` is always replaced, never rewritten, so a link to it is a copy
+    except OSError:  # a file system without links
+        shutil.copyfile(source, aside)
     os.replace(aside, target)

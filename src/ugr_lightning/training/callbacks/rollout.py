@@ -101,8 +101,8 @@ class RolloutEvaluation(Callback):
             pl_module.train(training)
         summary = summarize(results)
         values = {"success_rate": summary.rate, "success_low": summary.low, "success_high": summary.high}
-        for logger in trainer.loggers:
-            logger.log_metrics({f"rollout/{name}": value for name, value in values.items()}, step)
+        named = {f"rollout/{name}": value for name, value in values.items()}
+        pl_module.log_dict(named, on_step=False, on_epoch=True, rank_zero_only=True, batch_size=1)
         if video:
             log_image(trainer.loggers, "rollout/episode", video, step)
         print(f"step {step}: rollout {summary}", flush=True)
