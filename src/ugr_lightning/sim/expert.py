@@ -1,4 +1,4 @@
-"""Motion primitives of the scripted experts: smooth tool paths that become joint commands one control step at a time."""
+"""Motion primitives of the scripted experts: smooth tool paths as joint commands, one control step at a time."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ugr_lightning.sim.kinematics import (
-    HOME,
     SIDES,
     Array,
     TcpPose,
@@ -149,10 +148,10 @@ class Arms:
         for side in SIDES:
             if self._coming[side]:
                 self.joints[side] = self._coming[side].pop(0)
-        parts = [self.joints["left"], [self.opening["left"]], self.joints["right"], [self.opening["right"]]]
+        action = np.concatenate([np.append(self.joints[side], self.opening[side]) for side in SIDES])  # (14,)
         self._emitted += 1
         onset = minimum_jerk((self._emitted - 1) / _ONSET)
-        return ExpertStep(np.concatenate(parts).astype(np.float32), phase, float(slack * onset))
+        return ExpertStep(action.astype(np.float32), phase, float(slack * onset))
 
     def _plan(self, side: str, goal: TcpPose | Array, count: int) -> list[Array]:
         """Joint commands of a motion, added to what is left of the one before."""
@@ -195,6 +194,3 @@ def _straight_line(before: list[Array], target: TcpPose, start: Array) -> list[A
         path.append(found)
         last = found
     return path
-
-
-HOME_JOINTS = {side: HOME for side in SIDES}  # goal of a motion that brings both arms home

@@ -1,4 +1,4 @@
-"""The table with two arms, lights and three cameras, as a ManiSkill environment; a task adds its props and its rules."""
+"""The table with two arms, lights and three cameras, as a ManiSkill environment; tasks add props and rules."""
 
 from abc import abstractmethod
 from collections.abc import Iterator
@@ -78,7 +78,8 @@ class TwoArmEnv(BaseEnv):
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = [UID]
     SUPPORTED_REWARD_MODES = ("sparse", "none")
-    horizon: ClassVar[int]
+    horizon: ClassVar[int]  # control steps
+    version: ClassVar[int]  # raise it when the task changes, and recompute its evaluation seeds
 
     def __init__(
         self, *args: Any, setting: str = "demo_clean", image_size: tuple[int, int] = (120, 160), **kwargs: Any
@@ -94,7 +95,7 @@ class TwoArmEnv(BaseEnv):
         kwargs.setdefault("render_backend", "cpu")
         super().__init__(*args, **kwargs)
 
-    # ---------------------------------------------------------------------------------------------- what a task fills in
+    # ------------------------------------------------------------------------------------------ what a task fills in
 
     @abstractmethod
     def build(self, rng: np.random.Generator) -> None:
@@ -112,7 +113,7 @@ class TwoArmEnv(BaseEnv):
     def describe(self) -> dict[str, Any]:
         """Where things are, as plain containers."""
 
-    # ---------------------------------------------------------------------------------------------------- what a task uses
+    # ---------------------------------------------------------------------------------------------- what a task uses
 
     def touches(self) -> list[Touch]:
         """Contacts between fingers and props at the end of the last control step."""
@@ -128,7 +129,7 @@ class TwoArmEnv(BaseEnv):
         """Measured tool pose in the world."""
         return self.agent.robot.links_map[f"{side}_tcp"]._objs[0].entity_pose
 
-    # -------------------------------------------------------------------------------------------------- ManiSkill's hooks
+    # --------------------------------------------------------------------------------------------- ManiSkill's hooks
 
     @property
     def _default_sim_config(self) -> SimConfig:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.sim.expert import Arms, ExpertStep, facing, gripper_down
-from ugr_lightning.sim.kinematics import TcpPose, rotation_z
+from ugr_lightning.sim.kinematics import UP, TcpPose, rotation_z
 from ugr_lightning.sim.objects import Prop, pose_of
 from ugr_lightning.sim.scene import TwoArmEnv, side_of
 
@@ -29,6 +29,7 @@ class ClickAlarmclock(TwoArmEnv):
     """An alarm clock with a large button on top; either arm, straight down."""
 
     horizon = 200
+    version = 1
 
     def build(self, rng: np.random.Generator) -> None:
         """Place the clock on either side, turned any way."""
@@ -65,8 +66,8 @@ class ClickAlarmclock(TwoArmEnv):
         """Above the button while closing, straight down, and stay there."""
         side = side_of(self.button_point[0])
         rotation = gripper_down(facing(side))
-        tip = self.button_point + [0.0, 0.0, FINGERTIP]
-        above, pressed = TcpPose(tip + [0.0, 0.0, HOVER], rotation), TcpPose(tip - [0.0, 0.0, PRESS_DEPTH], rotation)
+        tip = self.button_point + FINGERTIP * UP
+        above, pressed = TcpPose(tip + HOVER * UP, rotation), TcpPose(tip - PRESS_DEPTH * UP, rotation)
         yield from arms.move({side: above}, steps=54, phase="reach", grip={side: 0.0}, overlap=14)
         yield from arms.move({side: pressed}, steps=44, phase="press", slack=(1.0, 0.4, 0.0, 0.0))
         yield from arms.hold(8, phase="hold")

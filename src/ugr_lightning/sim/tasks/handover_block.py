@@ -7,7 +7,7 @@ import numpy as np
 from mani_skill.utils.structs import Actor
 
 from ugr_lightning.sim.expert import Arms, ExpertStep, facing, grasp_yaw, gripper_down, gripper_level
-from ugr_lightning.sim.kinematics import HOME, Array, TcpPose, rotation_z
+from ugr_lightning.sim.kinematics import HOME, UP, Array, TcpPose, rotation_z
 from ugr_lightning.sim.objects import Prop, pose_of
 from ugr_lightning.sim.scene import TwoArmEnv
 
@@ -31,6 +31,7 @@ class HandoverBlock(TwoArmEnv):
     """Left grasps from above, both meet in the middle, right takes the other end and places the block upright."""
 
     horizon = 450
+    version = 1
 
     def build(self, rng: np.random.Generator) -> None:
         """Place the block on the left and the pad on the right."""
@@ -66,8 +67,8 @@ class HandoverBlock(TwoArmEnv):
         centre, rotation = self.block_pose()
         yaw = grasp_yaw("left", float(np.arctan2(rotation[1, 0], rotation[0, 0])))
         down = gripper_down(yaw)
-        top = centre + [0.0, 0.0, GRASP]
-        above, lifted = TcpPose(top + [0.0, 0.0, 0.11], down), TcpPose(top + [0.0, 0.0, 0.12], down)
+        top = centre + GRASP * UP
+        above, lifted = TcpPose(top + 0.11 * UP, down), TcpPose(top + 0.12 * UP, down)
         yield from arms.move({"left": above}, steps=32, phase="reach", overlap=8)
         yield from arms.move({"left": TcpPose(top, down)}, steps=26, phase="descend", slack=(1.0, 0.0, 0.0, 0.0))
         yield from arms.grip({"left": 0.0}, steps=10, phase="grasp-left")
@@ -98,7 +99,7 @@ class HandoverBlock(TwoArmEnv):
         """Right tool pose that holds the block with its base `height` above the pad, as it sits in the hand now."""
         tool = self.tool_pose("right").to_transformation_matrix().astype(np.float64)
         offset = tool[:3, :3].T @ (self.block_pose().position - tool[:3, 3])
-        centre = self.pad_point + [0.0, 0.0, BLOCK_SIZE[2] / 2.0 + height]
+        centre = self.pad_point + (BLOCK_SIZE[2] / 2.0 + height) * UP
         return TcpPose(centre - rotation @ offset, rotation)
 
     def describe(self) -> dict[str, Any]:
