@@ -137,7 +137,10 @@ def _open_memmap(episodes: Sequence[Episode], shape: tuple[int, ...]) -> FrameSt
             array.flush()
 
         publish(path, write)
-    array = np.load(path, mmap_mode="r")
+    try:
+        array = np.load(path, mmap_mode="r")
+    except (OSError, EOFError, ValueError) as error:
+        raise DataError(path, f"frames {shape}", str(error), "Remove the file; it is made again.") from error
     if array.shape != shape or array.dtype != np.uint8:
         raise DataError(path, f"frames {shape}", array.shape, "Remove the file; it is made again.")
     return ArrayStore(array, path)

@@ -59,7 +59,7 @@ def find_dataset(file: h5py.File, key: str) -> h5py.Dataset:
 
 def _nearby(node: object, part: str) -> str:
     keys = list(node) if isinstance(node, h5py.Group) else []
-    return f"no '{part}' among {', '.join(keys[:8]) or 'no keys at all'}"
+    return f"no '{part}' among {', '.join(map(str, keys[:8])) or 'no keys at all'}"
 
 
 def has_key(file: h5py.File, key: str) -> bool:
