@@ -66,9 +66,10 @@ def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, record, mo
     def interrupted(*_):
         raise KeyboardInterrupt
 
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patch:
         patch.setattr(cache_module, "_decode_all", interrupted)
-        open_frames(_episodes(folder), "memmap")
+        with pytest.raises(KeyboardInterrupt):
+            open_frames(_episodes(folder), "memmap")
     store = open_frames(_episodes(folder), "memmap")
     np.testing.assert_array_equal(store.take(np.array([1]))[0], _episodes(folder)[0].images(1))
 

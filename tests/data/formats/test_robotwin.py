@@ -145,6 +145,19 @@ WRONG_ARGUMENTS = {
     "images": np.zeros((13, 3, 24, 32, 3), np.float32),
     "camera_parameters": [],
 }
+WRONG_IMAGES = {
+    "too few": np.zeros((12, 3, 24, 32, 3), np.uint8),
+    "two cameras": np.zeros((13, 2, 24, 32, 3), np.uint8),
+    "grey": np.zeros((13, 3, 24, 32, 1), np.uint8),
+    "no JPEGs": [(b"x", b"y", b"z")] * 13,
+}
+
+
+@pytest.mark.parametrize("case", WRONG_IMAGES)
+def test_wrong_images_are_refused_before_anything_is_written(case, tmp_path, arrays):
+    with pytest.raises(DataError, match="images"):
+        write_episode(episode_path(tmp_path, 0), **arrays(images=WRONG_IMAGES[case]))
+    assert not list(tmp_path.rglob("*.*"))
 
 
 @pytest.mark.parametrize("name", WRONG_ARGUMENTS)

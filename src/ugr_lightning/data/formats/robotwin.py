@@ -151,6 +151,12 @@ def _encoded(path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames:
         if images.dtype != np.uint8 or images.ndim != 5 or images.shape[-1] != 3:
             raise DataError(f"{path}:images", wanted, f"{images.shape} {images.dtype}", "Nothing was written.")
         images = [encode_frame(frame) for frame in images]
+    for step, frame in enumerate(images):
+        for data in frame:
+            try:
+                jpeg_size(bytes(data))
+            except ValueError as error:
+                raise DataError(f"{path}:images[{step}]", "JPEGs", str(error), "Nothing was written.") from error
     return {camera: [bytes(frame[v]) for frame in images] for v, camera in enumerate(CAMERAS)}
 
 
