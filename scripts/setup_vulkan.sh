@@ -18,8 +18,13 @@ BACKPORTS=/etc/apt/sources.list.d/bookworm-backports.list
 
 say() { printf '[vulkan] %s\n' "$*" >&2; }
 
-# In a process of its own: a bad driver ends the process instead of raising.
-probe() { OMP_NUM_THREADS=1 "$VENV/bin/python" -m ugr_lightning.sim.render 2>&1; }
+probe() {
+  OMP_NUM_THREADS=1 "$VENV/bin/python" -c 'import sys
+from ugr_lightning.sim.render import probe_rendering
+found = probe_rendering()
+print(found.message)
+sys.exit(not found.ok)' 2>&1
+}
 
 done_with() {
   say "rendering works: $1"

@@ -58,14 +58,15 @@ class ReferenceResNet18(nn.Module):
         for stage, stride in enumerate((1, 2, 2, 2), start=1):
             outputs = width << (stage - 1)
             blocks = ReferenceBlock(inputs, outputs, stride), ReferenceBlock(outputs, outputs, 1)
-            setattr(self, f"layer{stage}", nn.Sequential(*blocks))
+            self.add_module(f"layer{stage}", nn.Sequential(*blocks))
             inputs = outputs
 
     def forward(self, x: Tensor) -> Tensor:
         """(n, 3, H, W) float32 to (n, 8 width, H/32, W/32)."""
         x = functional.max_pool2d(functional.relu(self.bn1(self.conv1(x)), inplace=True), 3, 2, 1)
-        features: Tensor = self.layer4(self.layer3(self.layer2(self.layer1(x))))
-        return features
+        for stage in range(1, 5):
+            x = self.get_submodule(f"layer{stage}")(x)
+        return x
 
 
 class ReferenceLayer(nn.Module):
@@ -92,7 +93,9 @@ class ReferenceLayer(nn.Module):
         query = x + position
         x = self.norm1(x + self.dropout(self.self_attn(query, query, x, key_padding_mask=padding)[0]))
         last_norm = self.norm2
-        if self.multihead_attn is not None and self.norm3 is not None and memory is not None:
+        if self.multihead_attn is not None and self.norm3 is not None:
+            assert memory is not None
+            assert memory_position is not None
             seen = self.multihead_attn(x + position, memory + memory_position, memory)[0]  # (N, B, D)
             x, last_norm = self.norm2(x + self.dropout(seen)), self.norm3
         return last_norm(x + self.dropout(self.linear2(self.dropout(functional.relu(self.linear1(x))))))

@@ -1,0 +1,150 @@
+"""`ugr bench`: what this machine reaches, as ratios wherever there is something to compare with."""
+
+import json
+import os
+import platform
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal, TextIO
+
+import torch
+from rich.console import Console
+from rich.table import Table
+
+from ugr_lightning.analysis.benchmark import (
+    PAPER,
+    QUICK,
+    Measurement,
+    Size,
+    measure_data,
+    measure_query,
+    measure_simulation,
+    measure_training,
+)
+from ugr_lightning.data.folder import publish
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.models.precision import bf16_is_fast
+
+Part = Literal["training", "query", "data", "simulation"]
+PARTS: tuple[Part, ...] = ("training", "query", "data", "simulation")
+
+
+def run_bench(
+    out: TextIO,
+    *,
+    parts: Sequence[Part] = PARTS,
+    quick: bool = False,
+    threads: int | None = None,
+    processes: int = 2,
+    rounds: int | None = None,
+    json_path: Path | None = None,
+) -> int:
+    """Measure and print one table.
+
+    Ratios come from workloads that take turns within one run, so that they hold on a busy machine, where absolute
+    times do not.
+
+    Args:
+        out: where the table goes; plain lines where it is no terminal.
+        parts: what to measure.
+        quick: tiny sizes, to see that everything runs; the numbers then mean nothing.
+        threads: torch threads; None for one per core.
+        processes: simulators that run side by side.
+        rounds: times that each workload is timed; None for the default.
+        json_path: file for the numbers; None for none.
+
+    Returns:
+        Exit code 0.
+
+    Raises:
+        ConfigError: a part that does not exist, or a number below 1.
+        RenderError: the simulation is asked for and SAPIEN cannot render here.
+    """
+    unknown = [part for part in parts if part not in PARTS]
+    if unknown:
+        raise ConfigError("bench parts", ", ".join(PARTS), ", ".join(unknown), "Correct the name.")
+    for name, number in (("threads", threads), ("processes", processes), ("rounds", rounds)):
+        if number is not None and number < 1:
+            raise ConfigError(f"bench {name}", "at least 1", number, "Correct the number.")
+    if "simulation" in parts:
+        from ugr_lightning.sim.render import require_rendering
+
+        require_rendering()  # now, and not after minutes of measuring
+    size = QUICK if quick else PAPER
+    size = size if rounds is None else size._replace(rounds=rounds)
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads or len(os.sched_getaffinity(0)))
+    try:
+        machine = describe_machine()
+        print(", ".join(f"{key} {value}" for key, value in machine.items()), file=out)
+        measurements = list(_measure(parts, size, processes, Console(file=out)))
+    finally:
+        torch.set_num_threads(before)
+    print_measurements(measurements, out)
+    if json_path is not None:
+        content = {"machine": machine, "quick": quick, "measurements": [item._asdict() for item in measurements]}
+        text = json.dumps(content, indent=2) + "\n"
+
+        def write(partial: Path) -> None:
+            partial.write_text(text)
+
+        publish(json_path, write)
+        print(f"written to {json_path}", file=out)
+    return 0
+
+
+def describe_machine() -> dict[str, Any]:
+    """What the numbers depend on, in plain containers."""
+    bf16 = "bf16" if bf16_is_fast(torch.device("cpu")) else "fp32"
+    return {
+        "CPU": _processor(),
+        "cores": len(os.sched_getaffinity(0)),
+        "threads": torch.get_num_threads(),
+        "torch": torch.__version__,
+        "precision": bf16,
+        "load": round(os.getloadavg()[0], 1),
+    }
+
+
+def print_measurements(measurements: Sequence[Measurement], out: TextIO) -> None:
+    """Print measurements: a table on a terminal, aligned lines otherwise."""
+    head = ("what", "here", "reference", "ratio", "aim")
+    rows = [_row(item) for item in measurements]
+    if out.isatty():
+        table = Table(*head)
+        for row in rows:
+            table.add_row(*row)
+        Console(file=out).print(table)
+        return
+    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(len(head))]
+    for row in (head, *rows):
+        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip(), file=out)
+
+
+def _measure(parts: Sequence[Part], size: Size, processes: int, console: Console) -> Iterator[Measurement]:
+    workloads: dict[Part, Callable[[], Iterator[Measurement]]] = {
+        "training": lambda: measure_training(size),
+        "query": lambda: measure_query(size),
+        "data": lambda: measure_data(size),
+        "simulation": lambda: measure_simulation(size, processes),
+    }
+    for part in PARTS:
+        if part in parts:
+            with console.status(f"measuring: {part}"):
+                yield from workloads[part]()
+
+
+def _row(item: Measurement) -> tuple[str, str, str, str, str]:
+    reference = "" if item.reference is None else f"{_number(item.reference)} {item.unit}"
+    ratio = "" if item.ratio is None else f"{item.ratio:.2f}x"
+    return item.name, f"{_number(item.value)} {item.unit}", reference, ratio, item.aim
+
+
+def _number(value: float) -> str:
+    return f"{value:.1f}" if value < 100 else f"{value:.0f}"
+
+
+def _processor() -> str:
+    path = Path("/proc/cpuinfo")
+    names = [line for line in path.read_text().splitlines() if line.startswith("model name")] if path.is_file() else []
+    return names[0].partition(":")[2].strip() if names else platform.processor() or platform.machine()
