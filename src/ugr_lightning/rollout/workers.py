@@ -44,6 +44,8 @@ class Worker:
         self._build = pickle.dumps(build)
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: connection.Connection | None = None
+        self.busy = False
+        """Whether an answer is outstanding."""
 
     def __enter__(self) -> Self:
         self.launch()
@@ -74,13 +76,14 @@ class Worker:
             process_group=0,  # Ctrl-C reaches the parent only, which ends its workers in order
         )
         theirs.close()
-        self._connection = ours
+        self._connection, self.busy = ours, True
         ours.send_bytes(self._build)
 
     def send(self, method: str, *args: Any) -> None:
         """Call a method of the object, without waiting for it."""
         try:
             self._open().send((method, args))
+            self.busy = True
         except OSError as error:
             raise self._lost() from error
 
@@ -97,6 +100,7 @@ class Worker:
                 self.kill()
                 raise WorkerLostError(f"{self.name} did not answer within {timeout_s:.0f} s and was killed")
             value, error = link.recv()
+            self.busy = False
         except (OSError, EOFError) as failure:
             raise self._lost() from failure
         if error is not None:
@@ -178,12 +182,19 @@ def _answer(link: connection.Connection, call: Callable[[], tuple[Any, Any]]) ->
         link.send((None, error))
         return None
     except Exception as error:
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        got = f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
+        got = describe_error(error)
         link.send((None, SimulationError("simulator process", "no fault", got, "Report this with its command.")))
         return None
     link.send((value, None))
     return kept
+
+
+def describe_error(error: Exception) -> str:
+    """One line on an exception: a user's error as it is, another one with its kind and place."""
+    if isinstance(error, UGRError):
+        return str(error)
+    place = traceback.extract_tb(error.__traceback__)[-1]
+    return f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
 
 
 def _end_with_parent(parent: int) -> None:
@@ -193,7 +204,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 def open_simulator(simulator: Callable[..., Any] | None, task: str, **settings: Any) -> Any:
-    """Open a simulator in this process.
+    """Open a simulator in this process and show it one scene: the first picture compiles shaders for seconds.
 
     Args:
         simulator: what to call in place of `sim.Simulator`, or None.
@@ -204,4 +215,6 @@ def open_simulator(simulator: Callable[..., Any] | None, task: str, **settings: 
         from ugr_lightning.sim.simulator import Simulator
 
         simulator = Simulator
-    return simulator(task, **settings)
+    opened = simulator(task, **settings)
+    opened.reset(0)
+    return opened

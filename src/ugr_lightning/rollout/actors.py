@@ -1,0 +1,216 @@
+"""What can act in the simulator: a policy, and the dummies `zero`, `random` and `expert` to compare it with."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import torch
+
+from ugr_lightning.contract import ACTION_DIM, CAMERAS, ChunkPolicy, Observation
+from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.rollout.aggregation import Execution, make_execution
+from ugr_lightning.rollout.noise import GRIPPERS
+
+
+class Decision(NamedTuple):
+    """What an actor does with a slot in this control step.
+
+    Args:
+        action: (14,) command; None leaves it to the expert in the simulator.
+        log_variance: (K,) s_k of the chunk that was predicted in this step; None where there is none.
+    """
+
+    action: np.ndarray | None
+    log_variance: np.ndarray | None = None
+
+
+class Actor(ABC):
+    """Decides for all running slots at once, one control step after the other.
+
+    Attributes:
+        name: what results call it.
+        execution: how chunks are executed, as results say it; `1` where there are no chunks.
+        cameras: the pictures it needs; without any the simulators do not render.
+    """
+
+    name: str
+    execution: str = "1"
+    cameras: tuple[str, ...] = ()
+
+    def begin(self, slots: int, execution: str | int) -> None:  # noqa: B027 - most have nothing to prepare
+        """Prepare for a run.
+
+        Args:
+            slots: number of slots.
+            execution: `aggregate` or the number of steps executed of each chunk.
+        """
+
+    def end(self) -> None:  # noqa: B027 - most have nothing to tidy up
+        """Tidy up after a run."""
+
+    @abstractmethod
+    def start(self, slot: int, seed: int, frame: Any) -> None:
+        """An episode begins in a slot; `frame` is its first one."""
+
+    @abstractmethod
+    def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
+        """Decide for each running slot, given its newest frame."""
+
+
+class Zero(Actor):
+    """Keeps commanding the pose that the episode started in."""
+
+    name = "zero"
+
+    def __init__(self) -> None:
+        self._home: dict[int, np.ndarray] = {}
+
+    def start(self, slot: int, seed: int, frame: Any) -> None:
+        """Remember the pose."""
+        self._home[slot] = np.array(frame.commanded, np.float32)
+
+    def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
+        """The remembered pose."""
+        return {slot: Decision(self._home[slot]) for slot in frames}
+
+
+class Random(Actor):
+    """Commands a new pose around the first one every ten steps; the seed of the episode decides which.
+
+    Args:
+        reach: largest distance of a joint from the first pose, rad; grippers take any opening.
+        hold: control steps per pose.
+    """
+
+    name = "random"
+
+    def __init__(self, reach: float = 0.5, hold: int = 10) -> None:
+        self._reach, self._hold = reach, hold
+        self._slots: dict[int, tuple[np.random.Generator, np.ndarray]] = {}
+        self._steps: dict[int, int] = {}
+        self._poses: dict[int, np.ndarray] = {}
+
+    def start(self, slot: int, seed: int, frame: Any) -> None:
+        """Seed the episode's random numbers."""
+        self._slots[slot] = (np.random.default_rng(seed), np.array(frame.commanded, np.float32))
+        self._steps[slot] = 0
+
+    def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
+        """The pose of the moment."""
+        for slot in frames:
+            random, home = self._slots[slot]
+            if self._steps[slot] % self._hold == 0:
+                pose = home + random.uniform(-self._reach, self._reach, ACTION_DIM)
+                pose[list(GRIPPERS)] = random.uniform(0.0, 1.0, len(GRIPPERS))
+                self._poses[slot] = pose.astype(np.float32)
+            self._steps[slot] += 1
+        return {slot: Decision(self._poses[slot]) for slot in frames}
+
+
+class Expert(Actor):
+    """Leaves every command to the task's scripted expert."""
+
+    name = "expert"
+
+    def start(self, slot: int, seed: int, frame: Any) -> None:
+        """Nothing to do: the expert lives in the simulator."""
+
+    def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
+        """No command of its own."""
+        return dict.fromkeys(frames, Decision(None))
+
+
+class PolicyActor(Actor):
+    """A policy, queried once per control step for all slots that need a chunk.
+
+    The batch always has one row per slot, used or not, so that the size of the batch, which decides how sums are
+    split up, never depends on which episodes happen to be running.
+
+    Args:
+        policy: predicts the chunks.
+        name: what results call it; None takes the name of its class.
+        state: what it sees of the joints, `commanded` or `measured`; as in its training.
+    """
+
+    def __init__(
+        self, policy: ChunkPolicy, *, name: str | None = None, state: Literal["commanded", "measured"] = "commanded"
+    ) -> None:
+        unknown = [camera for camera in policy.cameras if camera not in CAMERAS]
+        if unknown:
+            fix = "Roll out a policy that was trained on these cameras."
+            raise CheckpointError("policy.cameras", f"cameras among {', '.join(CAMERAS)}", ", ".join(unknown), fix)
+        self.policy, self.state = policy, state
+        self.name = name or type(policy).__name__
+        self.cameras = tuple(policy.cameras)
+        self._views = [CAMERAS.index(camera) for camera in self.cameras]
+        self._execution: Execution | None = None
+        self._was_training = False
+
+    def begin(self, slots: int, execution: str | int) -> None:
+        """Make the execution and the fixed-size batch; the policy goes into evaluation mode."""
+        policy = self.policy
+        self._execution = make_execution(execution, policy.chunk_length, policy.action_dim, slots)
+        self.execution = self._execution.name
+        self._state = torch.zeros(slots, policy.state_dim)  # (B, S)
+        self._images: torch.Tensor | None = None
+        tensors = [*policy.parameters(), *policy.buffers()]
+        self._device = tensors[0].device if tensors else torch.device("cpu")
+        self._was_training = policy.training
+        policy.eval()
+
+    def end(self) -> None:
+        """Put the policy back into the mode it was in."""
+        self.policy.train(self._was_training)
+
+    def start(self, slot: int, seed: int, frame: Any) -> None:
+        """Forget the slot's chunks."""
+        assert self._execution is not None
+        self._execution.reset(slot)
+
+    def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
+        """Query the policy for the slots that need it, then execute all slots' chunks."""
+        assert self._execution is not None
+        asking = [slot for slot in sorted(frames) if self._execution.needs_query(slot)]
+        uncertainty: dict[int, np.ndarray] = {}
+        if asking:
+            chunks, log_variance = self._query({slot: frames[slot] for slot in asking})
+            for slot in asking:
+                self._execution.push(slot, chunks[slot])
+                if log_variance is not None:
+                    uncertainty[slot] = log_variance[slot]
+        return {slot: Decision(self._execution.next(slot), uncertainty.get(slot)) for slot in frames}
+
+    def _query(self, frames: Mapping[int, Any]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Chunks (B, K, A) and s_k (B, K) for a batch in which only the rows of `frames` are new."""
+        if self._images is None:
+            height, width = next(iter(frames.values())).images.shape[1:3]
+            shape = (len(self._state), len(self._views), height, width, 3)
+            self._images = torch.zeros(shape, dtype=torch.uint8)  # (B, V, H, W, 3)
+        for slot, frame in frames.items():
+            self._images[slot] = torch.from_numpy(frame.images[self._views])  # (V, H, W, 3)
+            self._state[slot] = torch.from_numpy(np.asarray(getattr(frame, self.state), np.float32))  # (S,)
+        images = self._images.to(self._device).permute(0, 1, 4, 2, 3)  # (B, V, 3, H, W), a view: channels stay last
+        with torch.no_grad():  # not inference_mode: what a policy caches here must still serve its training
+            chunk = self.policy.predict(Observation(images, self._state.to(self._device)))
+        log_variance = None if chunk.log_variance is None else chunk.log_variance.float().cpu().numpy()
+        return chunk.actions.float().cpu().numpy(), log_variance
+
+
+DUMMIES: dict[str, type[Actor]] = {"zero": Zero, "random": Random, "expert": Expert}
+
+
+def make_actor(actor: "Actor | ChunkPolicy | str") -> Actor:
+    """What `run_episodes` accepts: an actor, a policy, or the name of a dummy.
+
+    Raises:
+        ConfigError: a name that is none of `zero`, `random`, `expert`.
+    """
+    if isinstance(actor, ChunkPolicy):
+        return PolicyActor(actor)
+    if isinstance(actor, Actor):
+        return actor
+    if actor not in DUMMIES:
+        fix = "For a trained policy give its checkpoint."
+        raise ConfigError("policy", f"one of {', '.join(DUMMIES)}", actor, fix)
+    return DUMMIES[actor]()
