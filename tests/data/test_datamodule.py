@@ -181,7 +181,7 @@ def test_each_epoch_has_its_own_order_in_a_real_training(workers, recording_root
     assert watcher.validated == [(1, step) for step in range(0, 10, 2)] * 3
 
 
-@pytest.mark.filterwarnings("ignore")
+@pytest.mark.filterwarnings("ignore", "error:.*not resumable")
 @pytest.mark.parametrize("workers", [0, 2])
 @pytest.mark.parametrize("step", [2, 3, 4, 6])
 def test_a_resumed_training_continues_with_the_next_batch(step, workers, recording_root, tmp_path):

@@ -31,14 +31,14 @@ class Recording:
         noise_time_constant: how long that noise remembers, s.
         noise_bias: standard deviation of a constant joint offset drawn per episode, rad.
         image_size: (height, width) of the recorded pictures.
-        workers: simulator processes; None for one per core.
+        workers: simulator processes.
     """
 
     noise_std: float = 0.03
     noise_time_constant: float = 0.5
     noise_bias: float = 0.0
     image_size: tuple[int, int] = (120, 160)
-    workers: int | None = None
+    workers: int = 2
 
 
 DEFAULT_SAMPLING = Sampling()
@@ -188,7 +188,7 @@ class ChunkDataModule(lightning.LightningDataModule):
             return DataLoader(self.data, batch_size=self.batch_size, **common)
         replicas, rank = (1, 0) if trainer is None else (trainer.world_size, trainer.global_rank)
         sampler = BatchSampler(order, self.batch_size, replicas, rank)
-        return DataLoader(self.data, batch_size=None, sampler=sampler, **common)
+        return _ResumableLoader(self.data, batch_size=None, sampler=sampler, **common)
 
     def _position(self) -> tuple[int, int]:
         """Epoch and batches already trained on, as the trainer's loops were restored from a checkpoint.
@@ -204,6 +204,16 @@ class ChunkDataModule(lightning.LightningDataModule):
         if batches.is_last_batch:
             return epochs.processed + 1, 0
         return epochs.processed, batches.current.processed
+
+
+class _ResumableLoader(DataLoader):
+    """Tells Lightning that it may resume in the middle of an epoch: the position is known from its own progress."""
+
+    def state_dict(self) -> dict[str, Any]:
+        return {}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        pass
 
 
 def _as_it_is(batch: Batch) -> Batch:
