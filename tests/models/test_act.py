@@ -11,6 +11,7 @@ from ugr_lightning.models.losses import refine_loss
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
 from ugr_lightning.models.refine.uncertainty import Uncertainty
+from ugr_lightning.models.vision import FrozenBatchNorm2d
 
 VARIANTS = {
     "base": {},
@@ -221,6 +222,32 @@ def test_prediction_does_not_depend_on_its_neighbours_in_the_batch(tiny, batch):
     together = policy.predict(batch.observation).actions
     alone = policy.predict(Observation(batch.images[1:2], batch.state[1:2])).actions
     assert torch.allclose(together[1:2], alone, atol=1e-5)
+
+
+@pytest.mark.parametrize("norm", ["batch", "frozen", "group"])
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+def test_inference_copy_predicts_the_same(tiny, batch, norm, precision):
+    policy = noisy_branch(tiny(backbone_norm=norm, refine=Full(), precision=precision, **COMPACT))
+    for name, buffer in policy.backbone.named_buffers():
+        if "running" in name or (norm == "frozen" and name.endswith(("weight", "bias"))):
+            buffer.uniform_(0.5, 1.5)
+    policy.backbone.pretrained.fill_(True)
+    fast = policy.for_inference()
+    expected, got = policy.predict(batch.observation), fast.predict(batch.observation)
+    difference = (got.actions - expected.actions).abs().mean() / expected.actions.std()
+    assert difference < (1e-5 if precision == "fp32" else 0.03)
+    assert policy.training
+    assert not any(parameter.requires_grad for parameter in fast.parameters())
+    assert not any(isinstance(m, torch.nn.BatchNorm2d | FrozenBatchNorm2d) for m in fast.backbone.modules())
+
+
+def test_inference_copy_has_a_life_of_its_own(tiny, batch):
+    policy = tiny()
+    fast = policy.for_inference()
+    before = fast.predict(batch.observation).actions
+    with torch.no_grad():
+        policy.action_head.bias += 1
+    assert torch.equal(fast.predict(batch.observation).actions, before)
 
 
 def test_prediction_ignores_the_posterior(tiny, batch):

@@ -48,6 +48,22 @@ def test_positions_reach_queries_and_keys_but_not_values():
     assert torch.allclose(ours(query, key, value), theirs(query, key, value)[0], atol=1e-6)
 
 
+def test_encoder_layer_adds_positions_to_queries_and_keys_only():
+    layer, x, position = EncoderLayer(16, 4, 32, 0.0).eval(), torch.randn(2, 7, 16), torch.randn(7, 16)
+    attended = layer.norm1(x + layer.self_attn(x + position, x + position, x))
+    expected = layer.norm2(attended + layer.linear2(layer.linear1(attended).relu()))
+    assert torch.allclose(layer(x, position), expected, atol=1e-6)
+
+
+def test_decoder_layer_adds_query_positions_in_both_attentions():
+    layer, x, position = DecoderLayer(16, 4, 32, 0.0).eval(), torch.randn(2, 5, 16), torch.randn(5, 16)
+    memory, keys = torch.randn(2, 7, 16), torch.randn(2, 7, 16)
+    y = layer.norm1(x + layer.self_attn(x + position, x + position, x))
+    y = layer.norm2(y + layer.multihead_attn(y + position, keys, memory))
+    expected = layer.norm3(y + layer.linear2(layer.linear1(y).relu()))
+    assert torch.allclose(layer(x, position, memory, keys), expected, atol=1e-6)
+
+
 def test_dropout_zeroes_its_share_and_keeps_the_mean():
     x = torch.ones(1001, 999)
     y = drop(x, 0.1)

@@ -1,5 +1,6 @@
 """ACT, the Action Chunking Transformer, with the uncertainty-guided sparse refinement of the paper."""
 
+import copy
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Literal, NamedTuple
@@ -21,6 +22,7 @@ from ugr_lightning.contract import (
 from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.augmentation import jitter_colour, shift_images
 from ugr_lightning.models.cvae import Posterior
+from ugr_lightning.models.inference import fold_normalisation, store_weights_as
 from ugr_lightning.models.losses import (
     Reconstruction,
     coarse_loss,
@@ -247,6 +249,24 @@ class ACT(ChunkPolicy):
         if plan.refined is None:
             return Chunk(actions, log_variance=plan.log_variance)
         return Chunk(actions, coarse, plan.log_variance, plan.refined)
+
+    @torch.no_grad()
+    def for_inference(self) -> "ACT":
+        """A copy that answers the same queries faster and cannot learn.
+
+        Normalisation layers with fixed statistics are folded into their convolutions, weights are stored in the
+        arithmetic of the trunk, and the CVAE encoder is left out. Later changes to this policy do not reach the copy.
+
+        Returns:
+            A policy in evaluation mode; its state dict is not that of a checkpoint.
+        """
+        fast = copy.deepcopy(self).eval().requires_grad_(False)
+        fast.posterior = None
+        fold_normalisation(fast.backbone)
+        with autocast(self.precision, self.query_embed.device):
+            if torch.is_autocast_enabled(self.query_embed.device.type):
+                store_weights_as(fast, torch.bfloat16, keep=(fast.action_head, fast.uncertainty_head))
+        return fast
 
     def _plan(self, images: Tensor, state: Tensor, latent: Tensor, valid: Tensor) -> Plan:
         """From inputs in network units to a chunk in network units; the paper's method in order."""
