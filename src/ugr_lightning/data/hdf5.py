@@ -106,12 +106,26 @@ def read_array(file: h5py.File, key: str, shape: Sequence[int | None], kind: str
 
 
 def read_strings(file: h5py.File, key: str, length: int) -> tuple[str, ...]:
-    """Read `length` short strings.
+    """Read `length` short strings of fixed width.
 
     Raises:
         DataError: another shape or type.
     """
     found = find_dataset(file, key)
-    if found.shape != (length,) or h5py.check_string_dtype(found.dtype) is None:
+    if found.shape != (length,) or found.dtype.kind != "S":
         raise DataError(f"{file.filename}:{key}", f"{length} strings", f"{found.shape} {found.dtype}", FIX)
-    return tuple(str(value) for value in found.asstr(errors="replace")[()])
+    return tuple(value.decode(errors="replace") for value in found[()])
+
+
+def read_attribute(file: h5py.File, name: str) -> int | float | str | None:
+    """A single number or string of fixed width at the root of a file; None where there is no such thing.
+
+    Strings of variable width are passed over: a damaged one can keep the HDF5 library busy for ever.
+    """
+    if name not in file.attrs:
+        return None
+    attribute = file.attrs.get_id(name)
+    if attribute.shape != () or attribute.dtype.kind not in "iufS":
+        return None
+    value = file.attrs[name]
+    return value.decode(errors="replace") if isinstance(value, bytes) else value.item()

@@ -22,6 +22,7 @@ from ugr_lightning.data.hdf5 import (
     has_key,
     open_hdf5,
     read_array,
+    read_attribute,
     read_strings,
 )
 from ugr_lightning.data.jpeg import encode_frame, jpeg_size
@@ -100,10 +101,10 @@ def write_episode(
 
     def fill(file: h5py.File) -> None:
         file.attrs["ugr_format_version"] = FORMAT_VERSION
-        file.attrs["package_version"] = version("ugr-lightning")
-        file.attrs["task"], file.attrs["setting"] = task, setting
         file.attrs["seed"], file.attrs["control_hz"] = int(seed), float(control_hz)
-        file.attrs["noise"] = json.dumps(dict(noise or {}), sort_keys=True)
+        texts = {"task": task, "setting": setting, "noise": json.dumps(dict(noise or {}), sort_keys=True)}
+        for name, text in {**texts, "package_version": version("ugr-lightning")}.items():
+            file.attrs[name] = np.bytes_(text.encode())  # fixed width: see `read_attribute`
         _write_robot(file, commanded, endpose)
         for camera, disk in DISK_CAMERAS.items():
             group = file.create_group(f"observation/{disk}")
@@ -258,16 +259,16 @@ def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
         extras["slack"] = read_array(file, "ugr/slack", (frames - 1,))
     if has_key(file, "ugr/phase"):
         extras["phase"] = read_strings(file, "ugr/phase", frames - 1)
-    written = file.attrs.get("ugr_format_version", FORMAT_VERSION)
-    if written != FORMAT_VERSION:
+    written = read_attribute(file, "ugr_format_version")
+    if written not in (None, FORMAT_VERSION):
         got = f"version {written}"
         raise DataError(file.filename, f"format version {FORMAT_VERSION}", got, "Update ugr-lightning.")
     kinds: dict[str, type] = {"seed": int, "control_hz": float, "task": str, "setting": str, "noise": str}
     for name, kind in kinds.items():
-        if name not in file.attrs:
+        value = read_attribute(file, name)
+        if value is None:
             continue
-        try:
-            extras[name] = kind(file.attrs[name])
-        except (TypeError, ValueError) as error:
-            raise DataError(f"{file.filename}:@{name}", kind.__name__, file.attrs[name], FIX) from error
+        if not isinstance(value, kind):
+            raise DataError(f"{file.filename}:@{name}", kind.__name__, repr(value)[:80], FIX)
+        extras[name] = value
     return extras
