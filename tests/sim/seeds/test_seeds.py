@@ -1,0 +1,53 @@
+import hashlib
+import json
+
+import pytest
+
+from ugr_lightning.errors import ConfigError, SimulationError
+from ugr_lightning.sim import seeds
+from ugr_lightning.sim.tasks import load_task, task_names
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_every_task_ships_a_hundred_seeds_apart_from_demonstrations_and_selection(task):
+    found = seeds.evaluation_seeds(task)
+    assert len(found) == len(set(found)) == 100
+    assert found == sorted(found)
+    assert found[0] >= seeds.EVALUATION_START
+    assert found[-1] < seeds.SELECTION_START
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_the_seeds_belong_to_the_version_of_the_task_that_is_here(task):
+    content = json.loads(seeds._path(task).read_text())
+    assert content["version"] == load_task(task).version
+    assert content["task"] == task
+
+
+def test_the_expert_solves_the_first_evaluation_seed(click):
+    frame = click.reset(seeds.evaluation_seeds("click_alarmclock")[0])
+    for step in click.expert():
+        frame = click.step(step.action)
+    assert frame.success
+
+
+def test_the_hash_is_that_of_the_comma_joined_list():
+    assert seeds.seeds_hash([1, 20]) == hashlib.sha256(b"1,20").hexdigest()
+    assert seeds.seeds_hash([20, 1]) != seeds.seeds_hash([1, 20])
+
+
+def test_unknown_tasks_and_missing_lists_are_clear_errors(monkeypatch, tmp_path):
+    with pytest.raises(ConfigError, match="handover_block"):
+        seeds.evaluation_seeds("handover")
+    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "none.json")
+    with pytest.raises(SimulationError, match=r"python -m ugr_lightning\.sim\.seeds"):
+        seeds.evaluation_seeds("click_alarmclock")
+
+
+def test_a_list_is_computed_from_what_the_expert_solves(monkeypatch, tmp_path):
+    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "list.json")
+    monkeypatch.setattr(seeds, "COUNT", 2)
+    monkeypatch.setattr(seeds, "compute_evaluation_seeds", lambda task: {"task": task, "version": 1, "seeds": [100000]})
+    assert seeds.write_evaluation_seeds("click_alarmclock") == tmp_path / "list.json"
+    assert seeds.evaluation_seeds("click_alarmclock") == [100000]
+    assert [path.name for path in tmp_path.iterdir()] == ["list.json"]

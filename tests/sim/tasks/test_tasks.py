@@ -1,0 +1,70 @@
+import subprocess
+import sys
+
+import pytest
+
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.sim.simulator import Simulator
+from ugr_lightning.sim.tasks import environment_id, load_task, task_names, task_summaries
+
+
+def test_tasks_are_found_without_importing_the_simulator():
+    program = (
+        "import sys, ugr_lightning.sim.tasks as t, ugr_lightning.sim.seeds, ugr_lightning.sim.render;"
+        "import ugr_lightning.sim.simulator;"
+        "print(t.task_names(), sorted(t.task_summaries()));"
+        "print([m for m in ('sapien', 'mani_skill', 'gymnasium') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    names, loaded = done.stdout.splitlines()
+    assert "click_alarmclock" in names
+    assert "handover_block" in names
+    assert loaded == "[]"
+
+
+def test_every_task_has_a_summary_a_horizon_and_a_version():
+    summaries = task_summaries()
+    for name in task_names():
+        assert summaries[name].endswith(".")
+        task = load_task(name)
+        assert task.horizon > 0
+        assert task.version >= 1
+        assert environment_id(name).startswith("UGR-")
+
+
+def test_an_unknown_task_names_the_closest_ones():
+    with pytest.raises(ConfigError, match="Did you mean click_alarmclock"):
+        load_task("click_alarm_clock")
+    with pytest.raises(ConfigError, match="ugr tasks"):
+        load_task("qqqq")
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_the_expert_solves_seeds_without_and_with_noise_within_the_horizon(task):
+    import numpy as np
+
+    with Simulator(task, render=False) as simulator:
+        for seed, noise in ((0, 0.0), (1, 0.0), (2, 0.04)):
+            rng, offset = np.random.default_rng(seed), np.zeros(14)
+            frame, count = simulator.reset(seed), 0
+            for step in simulator.expert():
+                offset = 0.92 * offset + 0.39 * noise * rng.standard_normal(14)
+                offset[[6, 13]] = 0.0
+                frame, count = simulator.step(step.action + step.slack * offset), count + 1
+                assert 0.0 <= step.slack <= 1.0
+            assert frame.success, (task, seed, noise)
+            assert 50 < count < simulator.horizon
+
+
+@pytest.mark.parametrize("task", task_names())
+def test_doing_nothing_and_the_zero_action_do_not_succeed(task):
+    with Simulator(task, render=False) as simulator:
+        for seed in (0, 1):
+            frame = simulator.reset(seed)
+            for _ in range(40):
+                frame = simulator.step(frame.commanded * 0.0)
+            assert not frame.success
+            home = simulator.reset(seed).commanded
+            for _ in range(20):
+                frame = simulator.step(home)
+            assert not frame.success
