@@ -168,17 +168,15 @@ def measure_simulation(size: Size, processes: int) -> Iterator[Measurement]:
         RenderError: SAPIEN cannot render here.
         SimulationError: a simulator does not start.
     """
-    for image_size in size.control_sizes:
+    for image_size in size.control_sizes[1:]:
         with Worker(partial(Stopwatch, image_size), "benchmark process") as worker:
             worker.receive()
-            worker.send("control_step", size.control_steps, size.rounds)
-            seconds = worker.receive(EPISODE_TIMEOUT_S)
-        aim = "at most 12 ms" if image_size == (120, 160) else ""
-        yield Measurement(f"control step, 3 cameras {_dimensions(image_size)}", 1e3 * seconds, "ms", aim=aim)
+            yield _control_step(worker, image_size, size)
     image_size = size.control_sizes[0]
     workers = [Worker(partial(Stopwatch, image_size), f"benchmark process {i + 1}") for i in range(processes)]
     try:
         start_all(workers)
+        yield _control_step(workers[0], image_size, size)
         start = time.perf_counter()
         for index, worker in enumerate(workers):
             worker.send("episodes", size.episodes, index * size.episodes)
@@ -278,6 +276,13 @@ def _fetch(episodes: list[Episode], cache: Cache, size: Size) -> Callable[[], No
             data.__getitems__(generator.integers(len(data), size=size.batch).tolist())
 
     return fetch
+
+
+def _control_step(worker: Worker, image_size: tuple[int, int], size: Size) -> Measurement:
+    worker.send("control_step", size.control_steps, size.rounds)
+    seconds = worker.receive(EPISODE_TIMEOUT_S)
+    aim = "at most 12 ms" if image_size == (120, 160) else ""
+    return Measurement(f"control step, 3 cameras {_dimensions(image_size)}", 1e3 * seconds, "ms", aim=aim)
 
 
 def _slower_is_worse(name: str, seconds: dict[str, float], aim: str) -> Measurement:

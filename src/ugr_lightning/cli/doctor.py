@@ -82,7 +82,7 @@ def print_findings(findings: list[Finding], out: TextIO) -> None:
         table.add_row(f"[{COLOURS[status]}]{status}[/]", what, found, advice)
     console = Console(file=out)
     console.print(table)
-    console.print(closing)
+    console.print(closing, highlight=False)
 
 
 def check_python() -> Iterator[Finding]:

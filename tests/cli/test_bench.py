@@ -1,0 +1,58 @@
+import io
+import json
+
+import pytest
+
+from ugr_lightning.analysis import benchmark
+from ugr_lightning.analysis.benchmark import QUICK, Measurement, take_turns
+from ugr_lightning.cli.bench import print_measurements, run_bench
+from ugr_lightning.errors import ConfigError
+
+
+def test_every_part_is_measured_and_written_to_json(tmp_path):
+    out, path = io.StringIO(), tmp_path / "bench.json"
+    parts = ("training", "query", "data")
+    assert run_bench(out, parts=parts, quick=True, threads=1, rounds=1, json_path=path) == 0
+    content = json.loads(path.read_text())
+    names = [item["name"] for item in content["measurements"]]
+    assert [name.split(",")[0] for name in names] == ["training step", "one query", "data path", "data path"]
+    for item in content["measurements"]:
+        assert item["value"] > 0
+        assert item["ratio"] == pytest.approx(
+            item["reference"] / item["value"] if item["unit"] == "ms" else item["value"] / item["reference"]
+        )
+        assert item["name"] in out.getvalue()
+    assert content["machine"]["threads"] == 1
+    assert content["machine"]["CPU"] in out.getvalue()
+
+
+@pytest.mark.renders
+def test_the_simulator_is_timed_with_cameras_and_runs_whole_episodes():
+    step, episodes = benchmark.measure_simulation(QUICK, processes=1)
+    assert step.name == "control step, 3 cameras 40x30"
+    assert step.value > 0
+    assert episodes.unit == "episodes/min"
+    assert episodes.value > 0
+
+
+def test_workloads_take_turns_after_one_warm_up_each():
+    calls = []
+    take_turns({"a": lambda: calls.append("a"), "b": lambda: calls.append("b")}, rounds=3)
+    assert calls == ["a", "b"] + 3 * ["a", "b"]
+
+
+def test_a_terminal_free_report_has_one_line_a_measurement():
+    out = io.StringIO()
+    print_measurements([Measurement("step", 10.0, "ms", 33.0, 3.3, "fast"), Measurement("rate", 2500.0, "/s")], out)
+    header, first, second = out.getvalue().splitlines()
+    assert first.split() == ["step", "10.0", "ms", "33.0", "ms", "3.30x", "fast"]
+    assert second.split() == ["rate", "2500", "/s"]
+    assert header.startswith("what")
+
+
+@pytest.mark.parametrize("wrong", [{"parts": ("trainng",)}, {"threads": 0}, {"processes": 0}, {"rounds": 0}])
+def test_an_impossible_request_is_refused_before_anything_is_measured(wrong):
+    out = io.StringIO()
+    with pytest.raises(ConfigError):
+        run_bench(out, **{"parts": (), **wrong})
+    assert out.getvalue() == ""
