@@ -30,7 +30,7 @@ def open_hdf5(path: Path) -> Iterator[h5py.File]:
     with file:
         try:
             yield file
-        except (OSError, RuntimeError, KeyError, ValueError) as error:
+        except (OSError, RuntimeError, KeyError, ValueError, TypeError) as error:  # h5py raises all of these
             raise DataError(path, "a readable HDF5 file", f"a damaged one ({error})", FIX) from error
 
 
@@ -97,7 +97,7 @@ def read_array(file: h5py.File, key: str, shape: Sequence[int | None], kind: str
         raise DataError(where, {"f": "floating-point numbers", "b": "booleans"}[kind], f"{found.dtype}", FIX)
     if kind == "b":
         return np.asarray(found[()])
-    with np.errstate(over="ignore"):
+    with np.errstate(over="ignore", invalid="ignore"):
         values = np.asarray(found[()]).astype(np.float32)
     if not np.isfinite(values).all():
         first = np.argwhere(~np.isfinite(values))[0].tolist()
