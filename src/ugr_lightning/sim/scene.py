@@ -164,8 +164,9 @@ class TwoArmEnv(BaseEnv):
         super()._load_agent(options, sapien.Pose())
 
     def _load_scene(self, options: dict[str, Any]) -> None:
-        rng = np.random.default_rng(int(self._episode_seed[0]))
-        self._appearance = look = SETTINGS[self.setting](rng)
+        seed = int(self._episode_seed[0])
+        # A stream of its own, so that a seed has the same props under every setting.
+        self._appearance = look = SETTINGS[self.setting](np.random.default_rng([seed, 1]))
         Prop(self.scene).box((1.5, 1.1, 0.04), (0.0, 0.0, -0.02), look.table).build("table", sapien.Pose(), static=True)
         room = Prop(self.scene)
         for x, y in ((2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)):  # the shader's sky is black
@@ -174,7 +175,7 @@ class TwoArmEnv(BaseEnv):
         room.box((4.0, 4.0, 0.02), (0.0, 0.0, -0.75), look.floor, solid=False)
         room.box((4.0, 4.0, 0.02), (0.0, 0.0, 2.5), look.wall, solid=False)
         room.build("room", sapien.Pose(), static=True)
-        self.build(rng)
+        self.build(np.random.default_rng(seed))
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
         look = self._appearance
