@@ -114,6 +114,10 @@ class ChunkPolicy(Blueprinted, nn.Module, ABC):
     def predict(self, observation: Observation) -> Chunk:
         """The chunk to execute, without gradients and without randomness."""
 
+    def for_inference(self) -> "ChunkPolicy":
+        """A policy that predicts the same, only faster, and is not trained any more; by default the policy itself."""
+        return self
+
 
 @dataclass
 class EpisodeResult:
