@@ -1,0 +1,178 @@
+import numpy as np
+import pytest
+import torch
+from fake_policy import Reacher
+from fake_simulator import FakeSimulator
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.rollout.actors import Actor, Decision, PolicyActor, make_actor
+from ugr_lightning.rollout.runner import Runner, run_episodes
+from ugr_lightning.sim.seeds import seeds_hash
+
+SMALL = {"image_size": (24, 32), "progress": False, "simulator": FakeSimulator}
+SEEDS = [9, 0, 1, 2, 3, 4]
+
+
+def run(actor, seeds=SEEDS, task="reach", **more):
+    return run_episodes(actor, task, seeds, **({"workers": 1, "slots_per_worker": 2} | SMALL | more))
+
+
+@pytest.fixture(scope="module")
+def runner():
+    with Runner("reach", workers=2, slots_per_worker=2, image_size=(24, 32), simulator=FakeSimulator) as opened:
+        yield opened
+
+
+def outcome(results):
+    return [(result.seed, result.success, result.steps, result.log_variance, result.crash) for result in results]
+
+
+@pytest.mark.parametrize("execution", ["aggregate", 3, "5"])
+def test_a_policy_is_judged_seed_by_seed(runner, execution):
+    results = runner.run(Reacher(), SEEDS, execution=execution, progress=False, checkpoint="abc")
+    assert [result.seed for result in results] == SEEDS
+    assert all(result.success and result.first_success_step == result.steps for result in results)
+    first = results[0]
+    assert (first.policy, first.execution, first.checkpoint) == ("Reacher", str(execution), "abc")
+    assert first.seeds_hash == seeds_hash(SEEDS)
+    assert first.log_variance == {"mean": -3.0, "max": -1.0}
+    assert set(first.seconds) == {"query", "simulate"}
+
+
+def test_the_dummies_run_through_the_same_runner(runner):
+    zero = runner.run("zero", SEEDS, progress=False)
+    assert [(result.success, result.steps) for result in zero] == [(False, FakeSimulator.horizon)] * len(SEEDS)
+    expert = runner.run("expert", SEEDS, progress=False)
+    assert [result.success for result in expert] == [seed % 5 != 3 for seed in SEEDS]
+    traces = []
+    runner.run("random", SEEDS[:2], progress=False, on_result=lambda result, trace: traces.append(trace.actions))
+    again = []
+    runner.run("random", SEEDS[:2], progress=False, on_result=lambda result, trace: again.append(trace.actions))
+    assert all(np.array_equal(one, other) for one, other in zip(traces, again, strict=True))
+    assert np.abs(np.diff(np.stack(traces[0]), axis=0)).max() > 0.1
+
+
+def test_results_depend_on_the_seeds_and_not_on_slots_or_history(runner):
+    many = outcome(runner.run(Reacher(), SEEDS, progress=False))
+    assert outcome(runner.run(Reacher(), SEEDS, progress=False)) == many
+    alone = outcome(run(Reacher(), workers=1, slots_per_worker=1))
+    backwards = outcome(runner.run(Reacher(), SEEDS[::-1], progress=False))
+    assert alone == backwards[::-1] == many
+
+
+def test_every_query_has_the_full_batch_as_uint8_without_a_copy_to_channels_first(runner):
+    policy = Reacher()
+    policy.train()
+    runner.run(policy, SEEDS, progress=False)
+    assert set(policy.batch_sizes) == {runner.slots}
+    assert set(policy.layouts) == {((4, 3, 3, 24, 32), torch.uint8, True)}
+    assert set(policy.modes) == {False}
+    assert policy.training
+
+
+def test_cameras_are_found_by_name(runner):
+    class Colours(Reacher):
+        def predict(self, observation):
+            self.seen = observation.images[:, :, :, -1, -1].argmax(dim=2)  # (B, V): the fake paints view v in colour v
+            return super().predict(observation)
+
+    policy = Colours(cameras=(CAMERAS[2], CAMERAS[0]))
+    runner.run(policy, [0], progress=False)
+    assert policy.seen[0].tolist() == [2, 0]
+
+
+def test_an_unknown_camera_is_refused_by_name():
+    with pytest.raises(CheckpointError, match="cam_front"):
+        PolicyActor(Reacher(cameras=("cam_high", "cam_front")))
+
+
+@pytest.mark.parametrize("state", ["commanded", "measured"])
+def test_a_policy_sees_the_joints_it_was_trained_on(runner, state):
+    policy, traces = Reacher(), []
+    runner.run(PolicyActor(policy, state=state), [0], on_result=lambda result, trace: traces.append(trace))
+    seen = torch.stack([states[0] for states in policy.states]).numpy()
+    frames = traces[0].frames[:-1]
+    assert np.array_equal(seen, np.stack([getattr(frame, state) for frame in frames]))
+    assert not np.array_equal(frames[-1].commanded, frames[-1].measured)
+
+
+def test_chunks_are_queried_only_when_used_up(runner):
+    policy = Reacher()
+    results = runner.run(policy, [0], execution=5, progress=False)
+    assert len(policy.batch_sizes) == -(-results[0].steps // 5)
+
+
+def test_nan_never_reaches_the_simulator_and_names_step_and_seed():
+    results = run(Reacher(broken=0.47), seeds=[0, 4, 1])  # the goal of seed 4 lies above
+    assert [result.success for result in results] == [True, False, True]
+    assert "step 0 of seed 4" in results[1].crash
+
+
+def test_a_nan_later_in_the_episode_is_caught_at_its_step(runner):
+    class Late(Actor):
+        name = "late"
+
+        def start(self, slot, seed, frame):
+            self.steps = 0
+
+        def act(self, frames):
+            self.steps += 1
+            value = np.inf if self.steps == 4 else 0.0
+            return {slot: Decision(np.full(14, value, np.float32)) for slot in frames}
+
+    result = runner.run(Late(), [5], progress=False)[0]
+    assert (result.success, result.steps) == (False, 3)
+    assert "action at step 3 of seed 5" in result.crash
+
+
+@pytest.mark.parametrize(
+    ("task", "slots", "message"),
+    [("deadly", 1, "SIGKILL"), ("hang", 1, "did not answer"), ("faulty", 2, "ValueError: the scene fell over")],
+)
+def test_a_crash_costs_its_own_episode_only(task, slots, message):
+    results = run("expert", seeds=[0, 1, 2, 4, 5], task=task, workers=2 // slots, slots_per_worker=slots, timeout_s=5)
+    assert [result.success for result in results] == [True, True, False, True, True]
+    assert message in results[2].crash
+    assert [result.crash for result in results if result.seed != 2] == [None] * 4
+
+
+def test_results_arrive_as_they_come_with_their_trace_and_video(runner, tmp_path):
+    arrived = []
+    results = runner.run(
+        Reacher(),
+        [0, 1, 2],
+        video_dir=tmp_path,
+        video_seeds=[1],
+        progress=False,
+        on_result=lambda result, trace: arrived.append((result, trace)),
+    )
+    assert [path.name for path in tmp_path.iterdir()] == ["reach-1.gif"]
+    assert [result.video for result in results] == [None, str(tmp_path / "reach-1.gif"), None]
+    assert {result.seed for result, _ in arrived} == {0, 1, 2}
+    for result, trace in arrived:
+        assert len(trace.frames) == result.steps + 1 == len(trace.actions) + 1 == len(trace.log_variance) + 1
+        assert bool(trace.images) == (result.seed == 1)
+
+
+def test_simulators_do_not_render_for_those_who_do_not_look():
+    shapes = []
+
+    class Blind(Actor):
+        name = "blind"
+
+        def start(self, slot, seed, frame):
+            shapes.append(frame.images.shape)
+
+        def act(self, frames):
+            return {slot: Decision(frame.commanded) for slot, frame in frames.items()}
+
+    run(Blind(), seeds=[0])
+    assert shapes == [(0, 24, 32, 3)]
+
+
+def test_an_unknown_actor_or_execution_is_an_error(runner):
+    with pytest.raises(ConfigError, match="zero, random, expert"):
+        make_actor("exprt")
+    with pytest.raises(ConfigError, match="execution"):
+        runner.run(Reacher(), [0], execution="aggregated", progress=False)
