@@ -1,0 +1,90 @@
+"""The same rooms joined with the real simulator, on tiny pictures."""
+
+import numpy as np
+import pytest
+
+from ugr_lightning.data.folder import episode_path
+from ugr_lightning.data.formats.robotwin import read_episode
+from ugr_lightning.data.jpeg import decode_jpeg, encode_frame
+from ugr_lightning.rollout.actors import Actor, Decision
+from ugr_lightning.rollout.collect import collect
+from ugr_lightning.rollout.noise import Noise
+from ugr_lightning.rollout.recorder import record_episode
+from ugr_lightning.rollout.runner import Runner
+
+TASK, SIZE, SEED = "click_alarmclock", (30, 40), 0
+MEAN_JPEG_ERROR = 3
+"""Grey levels, at quality 95 with halved colour resolution; single pixels at edges of tiny pictures are far off."""
+
+
+class Witness(Actor):
+    """Holds still and remembers the first frame of each seed."""
+
+    name = "witness"
+    cameras = ("cam_high",)
+
+    def __init__(self):
+        self.first = {}
+
+    def start(self, slot, seed, frame):
+        self.first[seed] = frame
+
+    def act(self, frames):
+        return {slot: Decision(None) for slot in frames}
+
+
+@pytest.fixture(scope="module")
+def demonstration(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demonstrations")
+    collect(TASK, folder, episodes=1, image_size=SIZE, workers=1, progress=False)
+    return read_episode(episode_path(folder, 0))
+
+
+@pytest.fixture(scope="module")
+def runner():
+    with Runner(TASK, image_size=SIZE, workers=1, slots_per_worker=2, timeout_s=300) as opened:
+        yield opened
+
+
+def test_a_policy_first_sees_what_a_demonstration_first_showed(demonstration, runner, monkeypatch):
+    witness = Witness()
+    results = runner.run(witness, [7, SEED], progress=False)  # after another episode, and in the second slot
+    assert all(result.success for result in results)
+    seen = witness.first[SEED]
+    recorded = demonstration.images(0)  # (V, H, W, 3)
+    through_codec = np.empty_like(seen.images)
+    for picture, jpeg in zip(through_codec, encode_frame(seen.images), strict=True):
+        decode_jpeg(jpeg, picture)
+    assert demonstration.seed == SEED
+    assert np.array_equal(recorded, through_codec)
+    assert np.abs(recorded.astype(int) - seen.images).mean() < MEAN_JPEG_ERROR
+    assert np.array_equal(demonstration.state[0], seen.commanded)
+
+    from ugr_lightning.rollout import recorder
+    from ugr_lightning.sim.simulator import Simulator
+
+    raw = []
+    monkeypatch.setattr(recorder, "encode_frame", lambda images: raw.append(images.copy()) or ())
+    with Simulator(TASK, image_size=SIZE) as simulator:
+        record_episode(simulator, SEED, Noise())
+    assert np.array_equal(raw[0], seen.images), "before encoding they are the same bit for bit"
+
+
+def test_recorded_actions_stray_from_the_labels_and_still_succeed(demonstration):
+    strayed = np.abs(demonstration.state[1:] - demonstration.action[:-1])
+    assert 0.01 < strayed.max() < 0.3
+    exact = np.asarray(demonstration.extras["slack"])[:-1] == 0
+    assert exact.any()
+    assert np.allclose(strayed[exact], 0, atol=1e-6)
+
+
+def test_the_same_seeds_end_in_the_same_joints(runner):
+    def final(seeds):
+        joints = {}
+        runner.run(
+            "random", seeds, progress=False, on_result=lambda r, t: joints.update({r.seed: t.frames[-1].measured})
+        )
+        return joints
+
+    once, again = final([3, 4, 5]), final([5, 4, 3])
+    assert all(np.array_equal(once[seed], again[seed]) for seed in once)
