@@ -26,15 +26,15 @@ from ugr_lightning.sim.kinematics import (
     rotation_z,
 )
 
-VERSION = 2  # part of the cache key: raise it when the conversion below changes
+VERSION = 3  # part of the cache key: raise it when the conversion below changes
 FINGER_CLOSED, FINGER_OPEN = 0.0215, 0.057  # finger joint, metres
 _MILLIMETRE = 0.001
 _ASSETS = ("vx300s_left.xml", "vx300s_right.xml", "vx300s_dependencies.xml")
 _WITHOUT_COLLISION = ("1_base", "8_gripper_prop")  # inside other parts; they would only cost time
 _GREY = {"8_gripper_prop": 0.25, "10_gripper_finger_left": 0.32, "10_gripper_finger_right": 0.32}
 _DARK = 0.13
-_FACES, _FINGER_FACES, _GRIPPER_FACES, _BODY_FACES, _PART_FACES = 240, 160, 600, 400, 60
-_SCREW_SIZE = 8.0  # mm
+_FACES, _FINGER_FACES, _PART_FACES = 280, 250, 60
+_BOX_FACES, _SCREW_SIZE = 12, 8.0  # fewer faces are stray triangles; mm
 
 
 def dual_arm_urdf() -> Path:
@@ -118,15 +118,11 @@ def _decimate(mesh: trimesh.Trimesh, name: str) -> trimesh.Trimesh:
         return _simplify(mesh, _FINGER_FACES)
     if "gripper" not in name:
         return _simplify(mesh, _FACES)
-    # The gripper is an assembly of many solids, which simplify badly as one: keep the large ones, drop the screws.
-    solids = sorted(mesh.split(only_watertight=False), key=lambda solid: -float(np.prod(solid.extents + 1e-3)))
-    parts = []
-    for index, solid in enumerate(solids):
-        if index and np.sort(solid.extents)[1] < _SCREW_SIZE:
-            continue
-        simple = _simplify(solid, _PART_FACES if index else _BODY_FACES)
-        parts.append(simple if len(simple.faces) < 2 * _BODY_FACES else solid.convex_hull)
-    return _simplify(trimesh.util.concatenate(parts), _GRIPPER_FACES)  # type: ignore[arg-type]
+    # The gripper is an assembly of many solids and falls apart when simplified as one: hulls of the large ones.
+    solids = [solid for solid in mesh.split(only_watertight=False) if len(solid.faces) >= _BOX_FACES]
+    large = [solid for solid in solids if np.sort(solid.extents)[1] >= _SCREW_SIZE]
+    hulls = [_simplify(solid.convex_hull, _PART_FACES) for solid in large]
+    return trimesh.util.concatenate(hulls)  # type: ignore[return-value]
 
 
 def _simplify(mesh: trimesh.Trimesh, faces: int) -> trimesh.Trimesh:
