@@ -54,7 +54,7 @@ class PolicyModule(LightningModule):
         if stage == "fit":
             self.policy.set_statistics(statistics)
 
-    def on_train_epoch_start(self) -> None:
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Count logged steps right: Lightning adds one too many when it resumes at an epoch's boundary."""
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.trainer.global_step
 

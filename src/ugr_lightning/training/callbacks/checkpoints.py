@@ -44,6 +44,19 @@ class PolicyCheckpoints(Checkpoint):
             for name in better:
                 _link(folder / LAST, folder / name)
 
+    def on_save_checkpoint(self, trainer: Trainer, pl_module: LightningModule, checkpoint: dict[str, Any]) -> None:
+        """Store the loops as they stand at the beginning of the next epoch.
+
+        Lightning counts an epoch as complete only after its callbacks have saved. With `max_steps` it would go through
+        the end of this epoch once more when it resumes, and all that depends on the epoch's number would be one ahead.
+        """
+        loop = checkpoint["loops"]["fit_loop"]
+        for count in loop["epoch_progress"].values():
+            count["completed"] = count["processed"]
+        batches = loop["epoch_loop.batch_progress"]
+        batches["is_last_batch"] = False
+        batches["current"] = dict.fromkeys(batches["current"], 0)
+
     def _rules(self) -> tuple[tuple[str, str, int], ...]:
         return (BEST, self.monitor, 1 if self.mode == "min" else -1), (BEST_LOSS, "val/loss", 1)
 
