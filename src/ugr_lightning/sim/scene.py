@@ -140,7 +140,7 @@ class TwoArmEnv(BaseEnv):
     def _default_sensor_configs(self) -> list[CameraConfig]:
         height, width = self.image_size
         links = self.agent.robot.links_map
-        wrist = look_at((-0.02, 0.0, 0.11), (0.17, 0.0, 0.0))
+        wrist = look_at((0.01, 0.0, 0.125), (0.165, 0.0, 0.0))
         cameras = {
             "cam_high": (look_at((0.0, -0.55, 0.66), (0.0, -0.01, 0.06)), 50.0, None),
             "cam_right_wrist": (wrist, 70.0, links["right_gripper_link"]),
