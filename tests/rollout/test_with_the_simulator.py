@@ -1,16 +1,17 @@
 """The same rooms joined with the real simulator, on tiny pictures."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 
-from ugr_lightning.data.folder import episode_path
 from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.data.jpeg import decode_jpeg, encode_frame
+from ugr_lightning.rollout import recorder
 from ugr_lightning.rollout.actors import Actor, Decision
-from ugr_lightning.rollout.collect import collect
 from ugr_lightning.rollout.noise import Noise
-from ugr_lightning.rollout.recorder import record_episode
 from ugr_lightning.rollout.runner import Runner
+from ugr_lightning.rollout.workers import open_simulator
 
 TASK, SIZE, SEED = "click_alarmclock", (30, 40), 0
 MEAN_JPEG_ERROR = 3
@@ -34,10 +35,19 @@ class Witness(Actor):
 
 
 @pytest.fixture(scope="module")
-def demonstration(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("demonstrations")
-    collect(TASK, folder, episodes=1, image_size=SIZE, workers=1, progress=False)
-    return read_episode(episode_path(folder, 0))
+def recording(tmp_path_factory):
+    """A demonstration, and its pictures as they were before encoding."""
+    folder, pictures = tmp_path_factory.mktemp("demonstrations"), []
+
+    def watch(images):
+        pictures.append(images.copy())
+        return encode_frame(images)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(recorder, "encode_frame", watch)
+        open_task = partial(open_simulator, None, TASK, image_size=SIZE)
+        assert recorder.Recorder(open_task, Noise(), folder).record(SEED).failure is None
+    return read_episode(recorder.staged_episode(folder, SEED)), pictures
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +56,8 @@ def runner():
         yield opened
 
 
-def test_a_policy_first_sees_what_a_demonstration_first_showed(demonstration, runner, monkeypatch):
+def test_a_policy_first_sees_what_a_demonstration_first_showed(recording, runner):
+    demonstration, pictures = recording
     witness = Witness()
     results = runner.run(witness, [7, SEED], progress=False)  # after another episode, and in the second slot
     assert all(result.success for result in results)
@@ -59,18 +70,11 @@ def test_a_policy_first_sees_what_a_demonstration_first_showed(demonstration, ru
     assert np.array_equal(recorded, through_codec)
     assert np.abs(recorded.astype(int) - seen.images).mean() < MEAN_JPEG_ERROR
     assert np.array_equal(demonstration.state[0], seen.commanded)
-
-    from ugr_lightning.rollout import recorder
-    from ugr_lightning.sim.simulator import Simulator
-
-    raw = []
-    monkeypatch.setattr(recorder, "encode_frame", lambda images: raw.append(images.copy()) or ())
-    with Simulator(TASK, image_size=SIZE) as simulator:
-        record_episode(simulator, SEED, Noise())
-    assert np.array_equal(raw[0], seen.images), "before encoding they are the same bit for bit"
+    assert np.array_equal(pictures[0], seen.images), "before encoding they are the same bit for bit"
 
 
-def test_recorded_actions_stray_from_the_labels_and_still_succeed(demonstration):
+def test_recorded_actions_stray_from_the_labels_and_still_succeed(recording):
+    demonstration, _ = recording
     strayed = np.abs(demonstration.state[1:] - demonstration.action[:-1])
     assert 0.01 < strayed.max() < 0.3
     exact = np.asarray(demonstration.extras["slack"])[:-1] == 0
