@@ -159,3 +159,10 @@ def test_every_task_makes_a_gymnasium_environment():
     assert not bool(truncated)
     assert not bool(info["success"])
     environment.close()
+
+
+def test_rendering_changes_nothing_in_the_physics(click):
+    with Simulator("click_alarmclock", render=False) as blind:
+        for seen, unseen in zip(play(click, 6), play(blind, 6), strict=True):
+            np.testing.assert_array_equal(seen.measured, unseen.measured)
+            assert seen.success == unseen.success
