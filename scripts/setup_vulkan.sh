@@ -56,7 +56,7 @@ explain() {
     printf '  or without root, from conda-forge:\n'
   fi
   printf '    conda create -p ./.lavapipe -c conda-forge mesa-lavapipe libvulkan-loader xorg-libx11\n'
-  printf '    export VK_ICD_FILENAMES=$PWD/.lavapipe/share/vulkan/icd.d/lvp_icd.x86_64.json LD_LIBRARY_PATH=$PWD/.lavapipe/lib\n'
+  printf '    export VK_ICD_FILENAMES=$(ls $PWD/.lavapipe/share/vulkan/icd.d/lvp*.json) LD_LIBRARY_PATH=$PWD/.lavapipe/lib\n'
   printf '  (Mesa 24 or newer is needed; Ubuntu 22.04 has 23.2, which SAPIEN refuses.) Then: make setup\n'
   printf '[vulkan] Until then: reading data, training (without rollouts) and their tests work; recording demonstrations,\n'
   printf '[vulkan] rollouts and `make demo` do not, and tests that render are skipped and listed as such.\n\n'

@@ -1,5 +1,6 @@
 import io
 import json
+import threading
 
 import pytest
 
@@ -41,11 +42,19 @@ def test_workloads_take_turns_after_one_warm_up_each():
     assert calls == ["a", "b"] + 3 * ["a", "b"]
 
 
+def test_waiting_costs_wall_time_but_no_processor_time():
+    release = threading.Event()
+    pace = take_turns({"wait": lambda: release.wait(0.05)}, rounds=1)["wait"]
+    assert pace.cpu_seconds < pace.seconds
+
+
 def test_a_terminal_free_report_has_one_line_a_measurement():
     out = io.StringIO()
-    print_measurements([Measurement("step", 10.0, "ms", 33.0, 3.3, "fast"), Measurement("rate", 2500.0, "/s")], out)
+    print_measurements(
+        [Measurement("step", 10.0, "ms", 9.0, 33.0, 3.3, "fast"), Measurement("rate", 2500.0, "/s")], out
+    )
     header, first, second = out.getvalue().splitlines()
-    assert first.split() == ["step", "10.0", "ms", "33.0", "ms", "3.30x", "fast"]
+    assert first.split() == ["step", "10.0", "ms", "9.0", "ms", "33.0", "ms", "3.30x", "fast"]
     assert second.split() == ["rate", "2500", "/s"]
     assert header.startswith("what")
 

@@ -56,13 +56,26 @@ QUICK = Size(
 )
 
 
+class Pace(NamedTuple):
+    """How long a workload takes.
+
+    Args:
+        seconds: median wall-clock time.
+        cpu_seconds: median processor time, all threads together; with one thread, what an idle machine would take.
+    """
+
+    seconds: float
+    cpu_seconds: float
+
+
 class Measurement(NamedTuple):
     """One line of the report.
 
     Args:
         name: what was measured.
         value: the median, in `unit`.
-        unit: of `value` and `reference`.
+        unit: of `value`, `cpu` and `reference`.
+        cpu: the same by processor time instead of wall-clock time; None where several processes work.
         reference: the median of what it is compared with, measured in turns with it; None where there is nothing.
         ratio: how many times better than the reference; None without one.
         aim: what the project promises, as a sentence fragment.
@@ -71,27 +84,30 @@ class Measurement(NamedTuple):
     name: str
     value: float
     unit: str
+    cpu: float | None = None
     reference: float | None = None
     ratio: float | None = None
     aim: str = ""
 
 
-def take_turns(workloads: dict[str, Callable[[], Any]], rounds: int) -> dict[str, float]:
-    """Median seconds of each workload, run one after the other in every round, so that a busy machine slows all alike.
+def take_turns(workloads: dict[str, Callable[[], Any]], rounds: int) -> dict[str, Pace]:
+    """Time workloads one after the other in every round, so that a busy machine slows all alike.
 
     Args:
         workloads: by name; each is called once more beforehand, to warm up.
-        rounds: how many times each is timed.
+        rounds: how many times each is timed; the median counts.
     """
     for run in workloads.values():
         run()
-    seconds: dict[str, list[float]] = {name: [] for name in workloads}
+    wall: dict[str, list[float]] = {name: [] for name in workloads}
+    processor: dict[str, list[float]] = {name: [] for name in workloads}
     for _ in range(rounds):
         for name, run in workloads.items():
-            start = time.perf_counter()
+            start, start_processor = time.perf_counter(), time.process_time()
             run()
-            seconds[name].append(time.perf_counter() - start)
-    return {name: statistics.median(values) for name, values in seconds.items()}
+            wall[name].append(time.perf_counter() - start)
+            processor[name].append(time.process_time() - start_processor)
+    return {name: Pace(statistics.median(wall[name]), statistics.median(processor[name])) for name in workloads}
 
 
 def measure_training(size: Size) -> Iterator[Measurement]:
@@ -112,8 +128,8 @@ def measure_training(size: Size) -> Iterator[Measurement]:
         reference.loss(pixels, batch.state, batch.actions, batch.valid).backward()
         theirs.step()
 
-    seconds = take_turns({"ours": step, "reference": reference_step}, size.rounds)
-    yield _slower_is_worse(f"training step, {_describe(size)}", seconds, "at least 3.3 times faster")
+    paces = take_turns({"ours": step, "reference": reference_step}, size.rounds)
+    yield _slower_is_worse(f"training step, {_describe(size)}", paces, "at least 3.3 times faster")
 
 
 def measure_query(size: Size) -> Iterator[Measurement]:
@@ -133,9 +149,9 @@ def measure_query(size: Size) -> Iterator[Measurement]:
         "ours": partial(policy.predict, observation),
         "reference": reference_query,
     }
-    seconds = take_turns(runs, 3 * size.rounds)
+    paces = take_turns(runs, 3 * size.rounds)
     name = f"one query, {_describe(size._replace(batch=1))}"
-    yield _slower_is_worse(name, seconds, "at most 50 ms")
+    yield _slower_is_worse(name, paces, "at most 50 ms")
 
 
 def measure_data(size: Size) -> Iterator[Measurement]:
@@ -147,14 +163,15 @@ def measure_data(size: Size) -> Iterator[Measurement]:
             episodes = [_record(Path(folder), index, size) for index in range(2)]
             caches: tuple[Cache, ...] = ("ram", "memmap", "none")
             fetch: dict[str, Callable[[], None]] = {cache: _fetch(episodes, cache, size) for cache in caches}
-            seconds = take_turns(fetch, size.rounds)
+            paces = take_turns(fetch, size.rounds)
     finally:
         torch.set_num_threads(threads)
-    rates = {name: 8 * size.batch / each for name, each in seconds.items()}
+    samples = 8 * size.batch
+    reference = samples / paces["none"].seconds
     for cached in ("ram", "memmap"):
         name = f"data path, one thread, cache {cached}, {_dimensions(size.image_size)}"
-        ratio = rates[cached] / rates["none"]
-        yield Measurement(name, rates[cached], "samples/s", rates["none"], ratio, "at least 2500")
+        rate, cpu_rate = samples / paces[cached].seconds, samples / paces[cached].cpu_seconds
+        yield Measurement(name, rate, "samples/s", cpu_rate, reference, rate / reference, "at least 2500")
 
 
 def measure_simulation(size: Size, processes: int) -> Iterator[Measurement]:
@@ -201,11 +218,12 @@ class Stopwatch:
         self._simulator = open_simulator(None, TASK, image_size=image_size)
         self._simulator.reset(0)  # the first picture compiles shaders
 
-    def control_step(self, steps: int, rounds: int) -> float:
-        """Median over the rounds of the mean seconds of a control step."""
+    def control_step(self, steps: int, rounds: int) -> Pace:
+        """How long a control step takes: median over the rounds of the mean over the steps."""
         action = self._simulator.reset(0).commanded
         hold = {"hold": lambda: [self._simulator.step(action) for _ in range(steps)]}
-        return take_turns(hold, rounds)["hold"] / steps
+        pace = take_turns(hold, rounds)["hold"]
+        return Pace(pace.seconds / steps, pace.cpu_seconds / steps)
 
     def episodes(self, count: int, first_seed: int) -> int:
         """Run episodes of the expert; returns the control steps they took."""
@@ -280,14 +298,16 @@ def _fetch(episodes: list[Episode], cache: Cache, size: Size) -> Callable[[], No
 
 def _control_step(worker: Worker, image_size: tuple[int, int], size: Size) -> Measurement:
     worker.send("control_step", size.control_steps, size.rounds)
-    seconds = worker.receive(EPISODE_TIMEOUT_S)
+    pace = worker.receive(EPISODE_TIMEOUT_S)
     aim = "at most 12 ms" if image_size == (120, 160) else ""
-    return Measurement(f"control step, 3 cameras {_dimensions(image_size)}", 1e3 * seconds, "ms", aim=aim)
+    name = f"control step, 3 cameras {_dimensions(image_size)}"
+    return Measurement(name, 1e3 * pace.seconds, "ms", 1e3 * pace.cpu_seconds, aim=aim)
 
 
-def _slower_is_worse(name: str, seconds: dict[str, float], aim: str) -> Measurement:
-    ratio = seconds["reference"] / seconds["ours"]
-    return Measurement(name, 1e3 * seconds["ours"], "ms", 1e3 * seconds["reference"], ratio, aim)
+def _slower_is_worse(name: str, paces: dict[str, Pace], aim: str) -> Measurement:
+    ours, reference = paces["ours"], paces["reference"]
+    times = 1e3 * ours.seconds, "ms", 1e3 * ours.cpu_seconds, 1e3 * reference.seconds
+    return Measurement(name, *times, reference.seconds / ours.seconds, aim)
 
 
 def _describe(size: Size) -> str:

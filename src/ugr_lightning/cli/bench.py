@@ -108,7 +108,7 @@ def describe_machine() -> dict[str, Any]:
 
 def print_measurements(measurements: Sequence[Measurement], out: TextIO) -> None:
     """Print measurements: a table on a terminal, aligned lines otherwise."""
-    head = ("what", "here", "reference", "ratio", "aim")
+    head = ("what", "here", "by CPU time", "reference", "ratio", "aim")
     rows = [_row(item) for item in measurements]
     if out.isatty():
         table = Table(*head)
@@ -134,10 +134,11 @@ def _measure(parts: Sequence[Part], size: Size, processes: int, console: Console
                 yield from workloads[part]()
 
 
-def _row(item: Measurement) -> tuple[str, str, str, str, str]:
+def _row(item: Measurement) -> tuple[str, ...]:
     reference = "" if item.reference is None else f"{_number(item.reference)} {item.unit}"
     ratio = "" if item.ratio is None else f"{item.ratio:.2f}x"
-    return item.name, f"{_number(item.value)} {item.unit}", reference, ratio, item.aim
+    cpu = "" if item.cpu is None else f"{_number(item.cpu)} {item.unit}"
+    return item.name, f"{_number(item.value)} {item.unit}", cpu, reference, ratio, item.aim
 
 
 def _number(value: float) -> str:
