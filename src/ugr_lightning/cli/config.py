@@ -90,10 +90,13 @@ def explain(error: Exception, parser: ArgumentParser | None) -> ConfigError:
     """
     message = " ".join(str(error).split())
     unknown = re.findall(r"[Kk]ey '?\"?([\w.\-]+)'?\"? is not expected", message)
-    unknown += re.findall(r"(?:[Nn]o action for key|Nested key|option) '?\"?([\w.\-]+)", message)
+    unknown += re.findall(r"(?:[Nn]o action for key|Nested key|[Oo]ption) '?\"?([\w.\-]+)'?\"?", message)
     unknown += [word.lstrip("-").split("=")[0] for word in re.findall(r"[Uu]nrecognized arguments: (\S+)", message)]
     if not unknown:
-        return ConfigError("configuration", "values that the settings accept", message[:600], "Correct the value.")
+        keys = re.findall(r"[Kk]ey \"([\w.\-]+)\": ", message)
+        told = message.rpartition(f'"{keys[-1]}": ')[2] if keys else message
+        where = ".".join(keys) or "configuration"
+        return ConfigError(where, "a value that the key accepts", told[:600].rstrip("."), "Correct the value.")
     key = unknown[-1]
     known = set(_known_keys(parser, message))
     near = difflib.get_close_matches(key, known, n=3) or difflib.get_close_matches(

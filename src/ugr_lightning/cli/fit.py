@@ -41,7 +41,7 @@ class UGRCLI(LightningCLI):
 
     def __init__(self, args: list[str], default_run: str) -> None:
         self.default_run = default_run
-        quiet = {"exit_on_error": False}
+        strict = {"exit_on_error": False, "allow_abbrev": False}
         super().__init__(
             PolicyModule,
             ChunkDataModule,
@@ -55,7 +55,7 @@ class UGRCLI(LightningCLI):
                 "log_every_n_steps": 10,
             },
             seed_everything_default=0,
-            parser_kwargs={"exit_on_error": False, **{name: dict(quiet) for name in self.subcommands()}},
+            parser_kwargs={**strict, **{name: dict(strict) for name in self.subcommands()}},
             args=args,
             auto_configure_optimizers=False,
             load_from_checkpoint_support=False,
@@ -82,15 +82,21 @@ class UGRCLI(LightningCLI):
         parser.link_arguments("model", "data.chunk_length", lambda module: module.policy.chunk_length, "instantiate")
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
-        """Parse without Lightning's warning that `sys.argv` is there too."""
-        self.config = parser.parse_args(args)
+        """Parse; what is wrong becomes one paragraph that names the key."""
+        try:
+            self.config = parser.parse_args(args)
+        except argparse.ArgumentError as error:
+            cause = error.__cause__ or error.__context__
+            raise (cause if isinstance(cause, UGRError) else explain(error, self._parser(args[0]))) from None
 
     def _parse_ckpt_path(self) -> None:
         """Resolve `best` and `last` before Lightning, which would go on with fresh weights, sees them."""
         config = self.config[self.config.subcommand]
         config.run = config.run or self.default_run
         if config.get("ckpt_path"):
-            config.ckpt_path = str(resolve_checkpoint(config.ckpt_path, config.run, Path(config.trainer.default_root_dir)))
+            config.ckpt_path = str(
+                resolve_checkpoint(config.ckpt_path, config.run, Path(config.trainer.default_root_dir))
+            )
             print(f"checkpoint: {config.ckpt_path}")
         elif self.config.subcommand == "validate":
             fix = "Add --ckpt_path best (or last, or a file)."
@@ -147,18 +153,16 @@ def run(command: str, argv: Sequence[str]) -> int:
     """
     warnings.filterwarnings("ignore", message=".*does not have many workers.*")
     warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
-    warnings.filterwarnings("ignore", message=".*exists and is not empty.*")  # the log of a resumed run; it is continued
+    warnings.filterwarnings(
+        "ignore", message=".*exists and is not empty.*"
+    )  # the log of a resumed run; it is continued
     warnings.filterwarnings("ignore", message=".*will save all targets and predictions in the buffer.*")
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-    torch.set_num_threads(max(1, len(os.sched_getaffinity(0))) if "OMP_NUM_THREADS" not in os.environ else torch.get_num_threads())
-    try:
-        UGRCLI([command, *expand_includes(argv)], run_name(argv))
-    except argparse.ArgumentError as error:
-        cause: BaseException | None = error
-        while cause is not None and not isinstance(cause, UGRError):
-            cause = cause.__cause__ or cause.__context__
-        raise (cause if isinstance(cause, UGRError) else explain(error, None)) from None
+    torch.set_num_threads(
+        max(1, len(os.sched_getaffinity(0))) if "OMP_NUM_THREADS" not in os.environ else torch.get_num_threads()
+    )
+    UGRCLI([command, *expand_includes(argv)], run_name(argv))
     return 0
 
 

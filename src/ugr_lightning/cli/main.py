@@ -8,16 +8,16 @@ from collections.abc import Sequence
 from ugr_lightning.errors import UGRError
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("ugr_lightning.cli.demo:demo", "the whole loop in minutes: record, train, evaluate, show a table"),
-    "doctor": ("ugr_lightning.cli.commands:doctor", "check this machine and say what to do"),
-    "tasks": ("ugr_lightning.cli.commands:tasks", "list the simulated tasks"),
-    "collect": ("ugr_lightning.cli.commands:collect", "record demonstrations of a task's scripted expert"),
+    "demo": ("ugr_lightning.cli.demo:run", "the whole loop in minutes: record, train, evaluate, show a table"),
+    "doctor": ("ugr_lightning.cli.commands:run", "check this machine and say what to do"),
+    "tasks": ("ugr_lightning.cli.commands:run", "list the simulated tasks"),
+    "collect": ("ugr_lightning.cli.commands:run", "record demonstrations of a task's scripted expert"),
     "fit": ("ugr_lightning.cli.fit:run", "train a policy; records missing demonstrations first"),
     "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
-    "test": ("ugr_lightning.cli.commands:test", "success of a checkpoint on the evaluation seeds, both execution modes"),
-    "rollout": ("ugr_lightning.cli.commands:rollout", "let a checkpoint, or zero, random or expert, act in a task"),
-    "inspect": ("ugr_lightning.cli.inspect:inspect", "say what a checkpoint, an episode or a folder is"),
-    "bench": ("ugr_lightning.cli.commands:bench", "measure speed on this machine"),
+    "test": ("ugr_lightning.cli.commands:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
+    "rollout": ("ugr_lightning.cli.commands:run", "let a checkpoint, or zero, random or expert, act in a task"),
+    "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
+    "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }
 
 FIRST_RUN = """ugr-lightning: train and understand action-chunking robot policies.

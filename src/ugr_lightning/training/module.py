@@ -70,7 +70,9 @@ class PolicyModule(LightningModule):
     def validation_step(self, batch: Batch, batch_idx: int) -> None:
         """The objective, and the errors of what the robot would execute (latent z = 0)."""
         terms = self.policy.losses(batch)
-        self.log_dict({f"val/{name}": term for name, term in terms.items()}, batch_size=len(batch.state), sync_dist=True)
+        self.log_dict(
+            {f"val/{name}": term for name, term in terms.items()}, batch_size=len(batch.state), sync_dist=True
+        )
         chunk = self.last_chunk = self.policy.predict(batch.observation)
         self._score(batch, chunk)
 
@@ -150,7 +152,9 @@ class PolicyModule(LightningModule):
         dump.parent.mkdir(parents=True, exist_ok=True)
         content = {"batch": batch._asdict(), "state_dict": self.state_dict(), "policy": self.policy.blueprint()}
         torch.save(content, dump)
-        bad = ", ".join(f"{name} = {float(term.detach()):g}" for name, term in terms.items() if not torch.isfinite(term))
+        bad = ", ".join(
+            f"{name} = {float(term.detach()):g}" for name, term in terms.items() if not torch.isfinite(term)
+        )
         samples = ", ".join(f"{e}:{t}" for e, t in zip(batch.episode.tolist(), batch.step.tolist(), strict=True))
         return NumericsError(
             f"training step {step}",
@@ -162,6 +166,6 @@ class PolicyModule(LightningModule):
 
 
 def _scores() -> dict[str, Metric]:
-    means = "action_error first_frame_error coarse_error refined_error".split()
-    means += "coarse_error_inside_mask error_inside_mask error_outside_mask".split()
+    means = ["action_error", "first_frame_error", "coarse_error", "refined_error"]
+    means += ["coarse_error_inside_mask", "error_inside_mask", "error_outside_mask"]
     return {name: MeanMetric(nan_strategy="disable") for name in means} | {"spearman": SpearmanCorrCoef()}

@@ -92,7 +92,9 @@ def chunk_figure(batch: Batch, chunk: Chunk, sample: int = 0) -> Figure:
         axis.set_title(f"action {dim}", fontsize=8)
         axis.tick_params(labelsize=7)
     axes.flat[0].legend(fontsize=7)
-    figure.suptitle(f"episode {int(batch.episode[sample])}, step {int(batch.step[sample])}; shaded: refined", fontsize=9)
+    figure.suptitle(
+        f"episode {int(batch.episode[sample])}, step {int(batch.step[sample])}; shaded: refined", fontsize=9
+    )
     return figure
 
 
@@ -115,7 +117,9 @@ def step_figure(means: dict[str, Tensor]) -> Figure:
         if "deviation" in means:
             other.plot(means["deviation"], color="tab:green", ls="--", label="predicted deviation exp(s/2)")
         if "refined" in means:
-            other.bar(range(len(means["refined"])), means["refined"], color="tab:gray", alpha=0.3, label="refined, share")
+            other.bar(
+                range(len(means["refined"])), means["refined"], color="tab:gray", alpha=0.3, label="refined, share"
+            )
         other.set_ylim(bottom=0)
         other.legend(loc="lower right", fontsize=8)
     axis.legend(loc="upper left", fontsize=8)

@@ -9,8 +9,12 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_warn
 from matplotlib.figure import Figure
 
-from ugr_lightning.contract import EpisodeResult
+from ugr_lightning.contract import ChunkPolicy, EpisodeResult
 from ugr_lightning.errors import ConfigError, RenderError
+from ugr_lightning.rollout.actors import PolicyActor
+from ugr_lightning.rollout.lockstep import EpisodeTrace
+from ugr_lightning.rollout.results import append_result, summarize
+from ugr_lightning.rollout.runner import run_episodes
 from ugr_lightning.training.callbacks.averaging import averaged_weights
 from ugr_lightning.training.tensorboard import log_figure, log_image
 
@@ -85,47 +89,73 @@ class RolloutEvaluation(Callback):
             self._evaluate(trainer, pl_module, step)
 
     def _evaluate(self, trainer: Trainer, pl_module: LightningModule, step: int) -> None:
-        from ugr_lightning.rollout.results import append_result, summarize
-
         folder = Path(trainer.log_dir or trainer.default_root_dir)
-        training = pl_module.training
-        pl_module.eval()
-        try:
-            with averaged_weights(trainer, pl_module), tempfile.TemporaryDirectory() as scratch:
-                results = self._run(trainer, pl_module, Path(scratch))
-                video = _first_video(results)
-                for result in results:
-                    result.video = None
-                    append_result(folder / "rollouts" / f"step{step:07d}.jsonl", result)
-        finally:
-            pl_module.train(training)
+        with averaged_weights(trainer, pl_module), tempfile.TemporaryDirectory() as scratch:
+            results, uncertainty = self._run(trainer, pl_module, Path(scratch))
+            video = _first_video(results)
+        for result in results:
+            result.video = None  # it went to TensorBoard, not to a file that stays
+            append_result(folder / "rollouts" / f"step{step:07d}.jsonl", result)
         summary = summarize(results)
         values = {"success_rate": summary.rate, "success_low": summary.low, "success_high": summary.high}
         named = {f"rollout/{name}": value for name, value in values.items()}
         pl_module.log_dict(named, on_step=False, on_epoch=True, rank_zero_only=True, batch_size=1)
         if video:
             log_image(trainer.loggers, "rollout/episode", video, step)
-        print(f"step {step}: rollout {summary}", flush=True)
+        if uncertainty:
+            log_figure(trainer.loggers, "rollout/uncertainty", uncertainty_figure(uncertainty), step)
+        print(f"step {step}  rollout on {len(results)} selection seeds: {summary}", flush=True)
 
-    def _run(self, trainer: Trainer, pl_module: LightningModule, videos: Path) -> list[EpisodeResult]:
-        from ugr_lightning.rollout.runner import run_episodes
+    def _run(
+        self, trainer: Trainer, pl_module: LightningModule, videos: Path
+    ) -> tuple[list[EpisodeResult], list[np.ndarray]]:
+        """Results, and the s_k (K,) of each chunk of the first episode."""
         from ugr_lightning.sim.seeds import SELECTION_START
 
         data = trainer.datamodule  # type: ignore[attr-defined]
-        return run_episodes(
-            pl_module.policy,
+        policy = pl_module.policy
+        assert isinstance(policy, ChunkPolicy)
+        assert self.task is not None
+        seeds = [SELECTION_START + episode for episode in range(self.episodes)]
+        uncertainty: list[np.ndarray] = []
+
+        def keep(result: EpisodeResult, trace: EpisodeTrace) -> None:
+            if result.seed == seeds[0]:
+                uncertainty.extend(values for values in trace.log_variance if values is not None)
+
+        results = run_episodes(
+            PolicyActor(policy.for_inference(), name=type(policy).__name__, state=data.state),
             self.task,
-            [SELECTION_START + episode for episode in range(self.episodes)],
-            setting=getattr(data, "setting", "demo_clean"),
-            image_size=tuple(data.image_size),
+            seeds,
+            setting=data.setting,
+            image_size=data.image_size or data.demonstrations[0].image_size,
             execution=self.execution,
             workers=self.workers,
+            on_result=keep,
             video_dir=videos if self.video else None,
+            video_seeds=seeds[:1],
+            progress=False,
         )
+        return results, uncertainty
+
+
+def uncertainty_figure(log_variance: list[np.ndarray]) -> Figure:
+    """The predicted uncertainty of every chunk of an episode, one column per chunk.
+
+    Args:
+        log_variance: s_k (K,) of each chunk, in the order in which they were predicted.
+    """
+    figure = Figure(figsize=(7, 4), layout="constrained")
+    axis = figure.subplots()
+    picture = axis.imshow(np.stack(log_variance, axis=1), aspect="auto", origin="lower", interpolation="nearest")
+    figure.colorbar(picture, label="log-variance s_k")
+    axis.set_xlabel("chunk of the episode")
+    axis.set_ylabel("step k of the chunk")
+    return figure
 
 
 def _first_video(results: list[EpisodeResult]) -> bytes | None:
     for result in results:
-        if result.video and Path(result.video).suffix == ".gif":
+        if result.video:
             return Path(result.video).read_bytes()
     return None
