@@ -46,7 +46,7 @@ def _collect(
     root: str = "data/160x120",
     setting: str = "demo_clean",
     image_size: tuple[int, int] = (120, 160),
-    noise: Noise = Noise(),
+    noise: Noise = Noise(),  # noqa: B008 - frozen
     workers: int = 2,
     video: bool = False,
 ) -> int:

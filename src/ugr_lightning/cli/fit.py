@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Trainer
+from lightning.pytorch import Callback, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
 
 from ugr_lightning.cli.config import expand_includes, explain, run_name
@@ -108,14 +108,14 @@ class UGRCLI(LightningCLI):
         if config.get("logger") is None:
             kwargs["logger"] = run_loggers(*self._run_folder(config))
         kwargs["plugins"] = [*_listed(config.get("plugins")), AtomicCheckpointIO()]
-        always = [CounterSeeds(self._get(self.config, "seed_everything"))]
+        always: list[Callback] = [CounterSeeds(self._get(self.config, "seed_everything"))]
         if config.get("enable_progress_bar") is not False:
             always.append(TrainingProgress())
         config["callbacks"] = [*_listed(config.get("callbacks")), *always]
         return super().instantiate_trainer(**kwargs)
 
     def _run_folder(self, trainer_config: Any) -> tuple[Path, int | None]:
-        """A new `version_N`; or the checkpoint's own folder, with its step, when a fit goes on from a run's checkpoint."""
+        """A new `version_N`; or the folder and the step of the checkpoint, when a fit goes on from a run's."""
         home = Path(trainer_config["default_root_dir"]) / self._get(self.config, "run")
         checkpoint = Path(self._get(self.config, "ckpt_path") or "none")
         if self.subcommand == "fit" and re.fullmatch(r"version_\d+", checkpoint.parent.name):

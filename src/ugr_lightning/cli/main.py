@@ -1,4 +1,4 @@
-"""`ugr`: the one place that knows the command line. Each subcommand is one function; none is imported before it is asked for."""
+"""`ugr`: the one place that knows the command line; a subcommand is imported when it is asked for."""
 
 import importlib
 import os

@@ -16,9 +16,8 @@ def run_loggers(folder: Path, resumed_at: int | None = None) -> list[Logger]:
         resumed_at: optimiser step of the checkpoint that the run goes on from; later entries are superseded.
     """
     where: dict[str, Any] = {"save_dir": str(folder.parents[1]), "name": folder.parent.name, "version": folder.name}
-    purge = {} if resumed_at is None else {"purge_step": resumed_at}
     return [
-        TensorBoardLogger(default_hp_metric=False, **purge, **where),
+        TensorBoardLogger(default_hp_metric=False, purge_step=resumed_at, **where),
         ContinuedCSVLogger(keep_steps=resumed_at or 0, **where),
     ]
 

@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import torch
 from lightning.pytorch import LightningModule
+from lightning.pytorch.utilities.types import OptimizerLRScheduler
 from torch import Tensor, nn
 from torchmetrics import Metric
 from torchmetrics.aggregation import MeanMetric
@@ -114,7 +115,7 @@ class PolicyModule(LightningModule):
         assert isinstance(metric, Metric)
         return metric
 
-    def configure_optimizers(self) -> dict[str, Any]:
+    def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW with the backbone as a group of its own, and a schedule that counts optimiser steps."""
         named = [(name, p) for name, p in self.policy.named_parameters() if p.requires_grad]
         groups = [

@@ -1,0 +1,88 @@
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from tiny import TinyPolicy, train
+
+from ugr_lightning.contract import Observation
+from ugr_lightning.errors import CheckpointError
+from ugr_lightning.training.checkpoint import AtomicCheckpointIO, load_policy, read_checkpoint, sha256
+
+
+@pytest.fixture(scope="module")
+def checkpoint(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("runs") / "tiny" / "version_0"
+    train(folder, max_epochs=1)
+    return folder / "last.ckpt"
+
+
+def test_a_checkpoint_is_complete_in_itself(checkpoint):
+    policy, info = load_policy(checkpoint)
+    assert isinstance(policy, TinyPolicy)
+    assert not policy.training
+    assert float(policy.mean[0]) == 0.25, "the statistics are in it"
+    assert info.description["cameras"] == ["cam_high"]
+    assert info.data["task"] == "click_alarmclock"
+    assert info.data["split"] == {"train": [0, 1, 2], "validation": [3]}
+    assert info.data["image_size"] == [4, 4]
+    assert info.description["versions"]["torch"] == torch.__version__.split("+")[0] or info.description["versions"]
+    assert info.sha256 == sha256(checkpoint)
+    chunk = policy.predict(Observation(torch.zeros(1, 1, 3, 4, 4, dtype=torch.uint8), torch.zeros(1, 3)))
+    assert chunk.actions.shape == (1, 5, 3)
+
+
+def test_a_checkpoint_opens_where_no_class_may_be_looked_up(checkpoint):
+    program = f"""
+import pickle
+def refuse(*names): raise AssertionError(f"code was looked up: {{names}}")
+pickle.Unpickler.find_class = refuse
+import torch
+content = torch.load({str(checkpoint)!r}, weights_only=True)
+assert "policy" in content and "optimizer_states" in content
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
+
+
+class Payload:
+    def __reduce__(self):
+        return (Path.touch, (Path("was_run"),))
+
+
+def test_a_file_that_would_run_code_is_refused(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    torch.save({"policy": Payload()}, "evil.ckpt")
+    with pytest.raises(CheckpointError, match="could run code"):
+        load_policy("evil.ckpt")
+    assert not Path("was_run").exists()
+
+
+def test_damaged_missing_and_foreign_files_are_refused_in_one_paragraph(tmp_path, checkpoint):
+    cut = tmp_path / "cut.ckpt"
+    cut.write_bytes(checkpoint.read_bytes()[:2000])
+    foreign = tmp_path / "foreign.ckpt"
+    torch.save({"state_dict": {}}, foreign)
+    for path in (cut, foreign, tmp_path / "none.ckpt"):
+        with pytest.raises(CheckpointError, match=path.name):
+            load_policy(path)
+
+
+def test_another_camera_set_is_refused(checkpoint):
+    with pytest.raises(CheckpointError, match="cam_left_wrist"):
+        load_policy(checkpoint, cameras=("cam_high", "cam_left_wrist"))
+
+
+def test_a_full_disk_leaves_the_previous_checkpoint(tmp_path, monkeypatch):
+    path = tmp_path / "last.ckpt"
+    AtomicCheckpointIO().save_checkpoint({"step": 1}, path)
+
+    def full(content, file):
+        file.write(b"half")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", full)
+    with pytest.raises(CheckpointError, match="No space left"):
+        AtomicCheckpointIO().save_checkpoint({"step": 2}, path)
+    assert read_checkpoint(path) == {"step": 1}
+    assert list(tmp_path.iterdir()) == [path], "nothing half-written remains"

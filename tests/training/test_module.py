@@ -1,0 +1,72 @@
+import csv
+
+import pytest
+import torch
+from tiny import TinyData, TinyPolicy, TinySamples, collate, train
+
+from ugr_lightning.errors import NumericsError
+from ugr_lightning.training.module import PolicyModule
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """One short training, and its folder."""
+    folder = tmp_path_factory.mktemp("runs") / "tiny" / "version_0"
+    return train(folder, max_epochs=2), folder
+
+
+def test_every_loss_term_and_score_is_logged(run):
+    trainer, folder = run
+    logged = set(next(csv.reader((folder / "metrics.csv").open())))
+    expected = {
+        "train/loss",
+        "train/coarse",
+        "train/uncertainty",
+        "train/learning_rate",
+        "val/loss",
+        "val/action_error",
+    }
+    expected |= {"val/first_frame_error", "val/coarse_error", "val/refined_error", "val/spearman"}
+    expected |= {"val/coarse_error_inside_mask", "val/error_inside_mask", "val/error_outside_mask"}
+    assert expected <= logged
+
+
+def test_validation_scores_are_means_over_valid_steps_in_standard_deviations(run):
+    trainer, _ = run
+    module, data = trainer.lightning_module.eval(), TinySamples(range(3, 4))
+    batch = collate([data[i] for i in range(len(data))])
+    chunk = module.policy.predict(batch.observation)
+    error = ((chunk.actions - batch.actions).abs() / TinyData().statistics.action_std).mean(-1)
+    scores = {name: float(value) for name, value in trainer.callback_metrics.items()}
+    assert scores["val/action_error"] == pytest.approx(float(error[batch.valid].mean()), rel=1e-5)
+    assert scores["val/first_frame_error"] == pytest.approx(float(error[0][batch.valid[0]].mean()), rel=1e-5)
+    inside = batch.valid & chunk.refined
+    assert scores["val/error_inside_mask"] == pytest.approx(float(error[inside].mean()), rel=1e-5)
+    outside = batch.valid & ~chunk.refined
+    assert scores["val/error_outside_mask"] == pytest.approx(float(error[outside].mean()), rel=1e-5)
+    coarse = (chunk.coarse - batch.actions).abs().mean(-1)
+    assert scores["val/coarse_error"] == pytest.approx(float(coarse[batch.valid].mean()), rel=1e-5)
+
+
+def test_statistics_of_the_data_reach_the_policy(run):
+    trainer, _ = run
+    assert torch.equal(trainer.lightning_module.policy.mean, TinyData().statistics.action_mean)
+
+
+def test_a_nan_loss_stops_training_and_leaves_what_is_needed_to_replay_it(tmp_path):
+    folder = tmp_path / "runs" / "tiny" / "version_0"
+    with pytest.raises(NumericsError) as caught:
+        train(folder, TinyPolicy(poison_at=8), max_epochs=3)
+    assert "training step 7" in str(caught.value)
+    assert "coarse = nan" in str(caught.value)
+    dump = torch.load(folder / "not_finite_step7.pt", weights_only=True)
+    assert dump["batch"]["state"].shape[1] == 3
+    assert str(int(dump["batch"]["episode"][0])) + ":" in str(caught.value)
+    assert (folder / "last.ckpt").is_file(), "the checkpoint of the first epoch is still there"
+
+
+def test_schedule_warms_up_and_ends_at_a_hundredth():
+    module = PolicyModule(TinyPolicy(), warmup_steps=10, schedule="cosine")
+    factors = [module.learning_rate_factor(step, 110) for step in (0, 9, 10, 60, 110)]
+    assert factors == pytest.approx([0.1, 1.0, 1.0, 0.505, 0.01])
+    assert PolicyModule(TinyPolicy()).learning_rate_factor(10**6, 0) == 1.0
