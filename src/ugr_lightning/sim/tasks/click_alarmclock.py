@@ -18,18 +18,20 @@ TOUCH_RADIUS = 0.03
 X_RANGE = (0.05, 0.25)  # to the left or to the right of the middle
 Y_RANGE = (-0.2, 0.0)
 
-BUTTON_HEIGHT = 0.112  # top of the button above the table
-BUTTON_RADIUS = 0.018
+BUTTON_HEIGHT = 0.106  # top of the button above the table
+BUTTON_RADIUS = 0.022
+BODY = (0.10, 0.065, 0.078)  # flat on top, so that a touch within 3 cm of the button's middle is a touch of the clock
+FEET = 0.014
 FINGERTIP = 0.014  # fingertips beyond the TCP
 HOVER = 0.07  # fingertips above the button before they go straight down
-PRESS_DEPTH = 0.012  # commanded below the top, so that a policy's millimetres do not matter
+PRESS_DEPTH = 0.018  # commanded below the button's top, and below the body's: a policy's millimetres do not matter
 
 
 class ClickAlarmclock(TwoArmEnv):
     """An alarm clock with a large button on top; either arm, straight down."""
 
     horizon = 200
-    version = 1
+    version = 2
 
     def build(self, rng: np.random.Generator) -> None:
         """Place the clock on either side, turned any way."""
@@ -39,14 +41,16 @@ class ClickAlarmclock(TwoArmEnv):
         pose = pose_of((x, y, 0.0), rotation_z(self.yaw))
         red, white, black, yellow = (0.80, 0.10, 0.12), (0.97, 0.97, 0.93), (0.04, 0.04, 0.05), (1.0, 0.85, 0.05)
         clock = Prop(self.scene)
-        clock.cylinder(0.048, 0.05, (0.0, 0.0, 0.052), red, axis="y")
-        clock.cylinder(0.041, 0.002, (0.0, -0.0255, 0.052), white, axis="y", solid=False)
-        clock.box((0.005, 0.001, 0.028), (0.0, -0.027, 0.064), black, solid=False)
-        clock.box((0.022, 0.001, 0.005), (0.010, -0.027, 0.052), black, solid=False)
+        middle, front = FEET + BODY[2] / 2.0, -BODY[1] / 2.0
+        clock.box(BODY, (0.0, 0.0, middle), red)
+        clock.cylinder(0.034, 0.002, (0.0, front, middle), white, axis="y", solid=False)
+        clock.box((0.005, 0.001, 0.024), (0.0, front - 0.0015, middle + 0.010), black, solid=False)
+        clock.box((0.020, 0.001, 0.005), (0.009, front - 0.0015, middle), black, solid=False)
         for sign in (-1.0, 1.0):
-            clock.box((0.018, 0.045, 0.018), (0.03 * sign, 0.0, 0.009), black)
+            clock.box((0.018, 0.055, FEET), (0.035 * sign, 0.0, FEET / 2.0), black)
         clock.build("alarm_clock", pose, static=True)
-        Prop(self.scene).cylinder(BUTTON_RADIUS, 0.016, (0.0, 0.0, BUTTON_HEIGHT - 0.008), yellow).build(
+        height = BUTTON_HEIGHT - FEET - BODY[2]
+        Prop(self.scene).cylinder(BUTTON_RADIUS, height, (0.0, 0.0, BUTTON_HEIGHT - height / 2.0), yellow).build(
             "alarm_button", pose, static=True
         )
 
