@@ -3,7 +3,7 @@
 import json
 import os
 import platform
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal, TextIO
 
@@ -26,6 +26,7 @@ from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.precision import bf16_is_fast
 
 Part = Literal["training", "query", "data", "simulation"]
+WIDTHS = (52, 16, 16, 16, 7, 26)
 PARTS: tuple[Part, ...] = ("training", "query", "data", "simulation")
 
 
@@ -77,10 +78,9 @@ def run_bench(
     try:
         machine = describe_machine()
         print(", ".join(f"{key} {value}" for key, value in machine.items()), file=out)
-        measurements = list(_measure(parts, size, processes, Console(file=out)))
+        measurements = print_measurements(_measure(parts, size, processes, Console(file=out)), out)
     finally:
         torch.set_num_threads(before)
-    print_measurements(measurements, out)
     if json_path is not None:
         content = {"machine": machine, "quick": quick, "measurements": [item._asdict() for item in measurements]}
         text = json.dumps(content, indent=2) + "\n"
@@ -106,19 +106,36 @@ def describe_machine() -> dict[str, Any]:
     }
 
 
-def print_measurements(measurements: Sequence[Measurement], out: TextIO) -> None:
-    """Print measurements: a table on a terminal, aligned lines otherwise."""
+def print_measurements(measurements: Iterable[Measurement], out: TextIO) -> list[Measurement]:
+    """Print measurements: a table on a terminal; otherwise aligned lines, each as soon as it is there.
+
+    Args:
+        measurements: what is measured while it is iterated over.
+        out: where to.
+
+    Returns:
+        All of them.
+    """
     head = ("what", "here", "by CPU time", "reference", "ratio", "aim")
-    rows = [_row(item) for item in measurements]
     if out.isatty():
+        done = list(measurements)
         table = Table(*head)
-        for row in rows:
-            table.add_row(*row)
+        for item in done:
+            table.add_row(*_row(item))
         Console(file=out).print(table)
-        return
-    widths = [max(len(row[column]) for row in (head, *rows)) for column in range(len(head))]
-    for row in (head, *rows):
-        print("  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip(), file=out)
+        return done
+    _print_line(head, out)
+    done = []
+    for item in measurements:
+        _print_line(_row(item), out)
+        done.append(item)
+    return done
+
+
+def _print_line(cells: Sequence[str], out: TextIO) -> None:
+    print(
+        "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip(), file=out, flush=True
+    )
 
 
 def _measure(parts: Sequence[Part], size: Size, processes: int, console: Console) -> Iterator[Measurement]:
