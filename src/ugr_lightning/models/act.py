@@ -91,8 +91,6 @@ class ACT(ChunkPolicy):
         camera_embedding: give each camera a learned position of its own, so that the policy can tell them apart.
         position_in_values: add positions to the image tokens themselves, not to queries and keys alone.
         keypoints: number of spatial-softmax keypoints a camera, given as one more token each; 0 for none.
-        relative_actions: predict actions relative to the joints commanded now, so that what a wrist camera sees is
-            the correction to make, wherever the arm is.
         state_dropout: probability, per sample, of hiding the state in training; 1 hides it at run time as well.
         state_noise: standard deviation of noise on the state in training, in normalised units.
         image_shift: largest random displacement of the images in training, in pixels.
@@ -133,7 +131,6 @@ class ACT(ChunkPolicy):
         camera_embedding: bool = False,
         position_in_values: bool = False,
         keypoints: int = 0,
-        relative_actions: bool = False,
         state_dropout: float = 0.0,
         state_noise: float = 0.0,
         image_shift: int = 0,
@@ -143,14 +140,11 @@ class ACT(ChunkPolicy):
         super().__init__()
         if dim % heads or dim % 4:
             raise ConfigError("dim", f"a multiple of heads ({heads}) and of 4", dim, "Change `dim` or `heads`.")
-        if relative_actions and state_dim != action_dim:
-            fix = "Set `relative_actions` to false: this robot's state is not its last command."
-            raise ConfigError("relative_actions", f"state_dim = action_dim ({action_dim})", state_dim, fix)
         self.cameras, self.chunk_length = tuple(cameras), chunk_length
         self.state_dim, self.action_dim, self.latent_dim = state_dim, action_dim, latent_dim
         self.refine, self.refine_detach_coarse, self.causal = refine, refine_detach_coarse, causal
         self.reconstruction, self.kl_weight, self.uncertainty_weight = reconstruction, kl_weight, uncertainty_weight
-        self.relative_actions, self.state_dropout, self.state_noise = relative_actions, state_dropout, state_noise
+        self.state_dropout, self.state_noise = state_dropout, state_noise
         self.image_shift, self.color_jitter = image_shift, color_jitter
         self.position_in_values, self.precision = position_in_values, precision
         sizes = (dim, heads, feedforward, dropout)
@@ -211,7 +205,7 @@ class ACT(ChunkPolicy):
             CheckpointError: no normalisation statistics.
         """
         state = self._disturb_state(self.normalizer.state(batch.state))  # (B, S)
-        target = self.normalizer.action(batch.actions) - self._origin(batch.state)  # (B, K, A)
+        target = self.normalizer.action(batch.actions)  # (B, K, A)
         latent, posterior = self._encode_chunk(state, target, batch.valid)
         plan = self._plan(batch.images, state, latent, batch.valid)
         terms = {"coarse": coarse_loss(plan.coarse, target, batch.valid, self.reconstruction)}
@@ -247,12 +241,11 @@ class ACT(ChunkPolicy):
             latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
             whole = torch.ones(state.shape[0], self.chunk_length, dtype=torch.bool, device=state.device)
             plan = self._plan(observation.images, state, latent, whole)
-            origin = self._origin(observation.state)  # (B, 1, A)
-            actions = self.normalizer.robot_action(plan.actions + origin)  # (B, K, A)
+            actions = self.normalizer.robot_action(plan.actions)  # (B, K, A)
             if not actions.isfinite().all():
                 fix = "Training diverged or the file is damaged: use an earlier checkpoint, a lower learning rate."
                 raise NumericsError("predicted actions", "finite numbers", "a NaN or an infinity", fix)
-            coarse = actions if plan.refined is None else self.normalizer.robot_action(plan.coarse + origin)
+            coarse = actions if plan.refined is None else self.normalizer.robot_action(plan.coarse)
         if plan.refined is None:
             return Chunk(actions, log_variance=plan.log_variance)
         return Chunk(actions, coarse, plan.log_variance, plan.refined)
@@ -362,10 +355,6 @@ class ACT(ChunkPolicy):
             x = layer(x, position, memory, memory_keys, allowed)
         normed: Tensor = self.decoder_norm(x)
         return normed
-
-    def _origin(self, state: Tensor) -> Tensor:
-        """Where predicted actions start from, (B, 1, A), normalised as actions: the commanded joints, or zero."""
-        return self.normalizer.action(state)[:, None] if self.relative_actions else state.new_zeros(1, 1, 1)
 
     def _disturb_state(self, state: Tensor) -> Tensor:
         """Noise on the state and hiding it, (B, S), normalised; a hidden state is the mean state."""
