@@ -142,7 +142,7 @@ def test_a_kill_while_an_episode_is_filed_loses_nothing(reference, tmp_path, mon
 
 
 def test_another_recording_in_the_folder_is_an_error_that_says_what_differs(reference):
-    with pytest.raises(DataError, match=r"'std': 0.1.*'std': 0.03"):
+    with pytest.raises(DataError, match=r"'std': 0.1.*'std': 0.04"):
         record(reference, noise=Noise(std=0.1))
     with pytest.raises(DataError, match=r"image_size \[12, 16\]"):
         record(reference, episodes=9, image_size=(12, 16))

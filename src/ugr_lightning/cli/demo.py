@@ -17,8 +17,8 @@ def run(command: str, argv: Sequence[str]) -> int:
 
 
 def _demo(
-    config: list[str] = ["configs/uncert.yaml", "configs/demo.yaml"],  # noqa: B006 - jsonargparse copies it
-    episodes: int = 50,
+    config: list[str] = ["configs/uncert.yaml"],  # noqa: B006 - jsonargparse copies it
+    episodes: int = 100,
     workers: int = 2,
     root: str = "runs",
     run: str = "demo",

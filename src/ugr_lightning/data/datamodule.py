@@ -34,7 +34,7 @@ class Recording:
         workers: simulator processes.
     """
 
-    noise_std: float = 0.03
+    noise_std: float = 0.04
     noise_time_constant: float = 0.5
     noise_bias: float = 0.0
     image_size: tuple[int, int] = (120, 160)

@@ -28,7 +28,7 @@ class Noise:
     Source: Laskey et al. 2017, DART; LEARNING_NOTES, "the open problem".
     """
 
-    std: float = 0.03
+    std: float = 0.04
     time_constant: float = 0.5
     bias: float = 0.0
     attempts: int = 2
