@@ -7,15 +7,19 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 import torch
 
-from ugr_lightning.sim.render import probe_rendering
+from ugr_lightning.sim.render import RenderProbe, probe_rendering
 
 torch.set_num_threads(1)
+
+
+def _probe() -> RenderProbe:
+    return probe_rendering(300)  # a crowded machine is slow, and not without a driver
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Skip tests marked `renders` where no driver works; UGR_REQUIRE_RENDERING=1, as in CI, lets them fail instead."""
     rendering = [item for item in items if item.get_closest_marker("renders")]
-    if not rendering or os.environ.get("UGR_REQUIRE_RENDERING") == "1" or probe_rendering().ok:
+    if not rendering or os.environ.get("UGR_REQUIRE_RENDERING") == "1" or _probe().ok:
         return
     for item in rendering:
-        item.add_marker(pytest.mark.skip(reason=probe_rendering().message))
+        item.add_marker(pytest.mark.skip(reason=_probe().message))
