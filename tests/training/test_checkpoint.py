@@ -27,7 +27,7 @@ def test_a_checkpoint_is_complete_in_itself(checkpoint):
     assert info.data["task"] == "click_alarmclock"
     assert info.data["split"] == {"train": [0, 1, 2], "validation": [3]}
     assert info.data["image_size"] == [4, 4]
-    assert info.description["versions"]["torch"] == torch.__version__.split("+")[0] or info.description["versions"]
+    assert info.description["versions"]["torch"] == torch.__version__
     assert info.sha256 == sha256(checkpoint)
     chunk = policy.predict(Observation(torch.zeros(1, 1, 3, 4, 4, dtype=torch.uint8), torch.zeros(1, 3)))
     assert chunk.actions.shape == (1, 5, 3)
@@ -36,8 +36,9 @@ def test_a_checkpoint_is_complete_in_itself(checkpoint):
 def test_a_checkpoint_opens_where_no_class_may_be_looked_up(checkpoint):
     program = f"""
 import pickle
-def refuse(*names): raise AssertionError(f"code was looked up: {{names}}")
-pickle.Unpickler.find_class = refuse
+class Refusing(pickle._Unpickler):
+    def find_class(self, *names): raise AssertionError(f"code was looked up: {{names}}")
+pickle.Unpickler = Refusing
 import torch
 content = torch.load({str(checkpoint)!r}, weights_only=True)
 assert "policy" in content and "optimizer_states" in content

@@ -1,0 +1,82 @@
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.folder import episode_path, write_seeds
+from ugr_lightning.data.formats.robotwin import write_episode
+
+ROOT = Path(__file__).parents[2]
+sys.path.insert(0, str(ROOT / "tests" / "training"))
+
+
+def write_demonstration(folder, index, steps=12):
+    """A made-up episode of 8x12 pictures."""
+    rng = np.random.default_rng(index)
+    cameras = {
+        name: {"intrinsic_cv": np.eye(3), "extrinsic_cv": np.eye(3, 4), "cam2world_gl": np.eye(4)} for name in CAMERAS
+    }
+    write_episode(
+        episode_path(folder, index),
+        images=rng.integers(0, 255, (steps + 1, 3, 8, 12, 3), dtype=np.uint8),
+        commanded=rng.normal(size=(steps + 1, 14)).astype(np.float32),
+        measured=np.zeros((steps + 1, 14), np.float32),
+        endpose=np.zeros((steps + 1, 2, 7)),
+        contacts=np.zeros((steps + 1, 2), bool),
+        expert_action=rng.normal(size=(steps, 14)).astype(np.float32),
+        phase=["move"] * steps,
+        slack=np.zeros(steps, np.float32),
+        camera_parameters=cameras,
+        task="click_alarmclock",
+        setting="demo_clean",
+        seed=index,
+        control_hz=25.0,
+    )
+
+
+@pytest.fixture(scope="session")
+def recording(tmp_path_factory):
+    """Root of a recording of five made-up demonstrations."""
+    root = tmp_path_factory.mktemp("data")
+    folder = root / "click_alarmclock" / "demo_clean"
+    for index in range(5):
+        write_demonstration(folder, index)
+    write_seeds(folder, range(5))
+    return root
+
+
+TINY = """
+trainer:
+  max_steps: 6
+  log_every_n_steps: 1
+  accelerator: cpu
+  enable_progress_bar: false
+model:
+  learning_rate: 0.01
+  schedule: cosine
+  policy:
+    class_path: tiny.TinyPolicy
+    init_args:
+      dim: 14
+      cameras: [cam_high, cam_right_wrist, cam_left_wrist]
+data:
+  root: {root}
+  episodes: 5
+  batch_size: 4
+  val_stride: 3
+  sampling:
+    samples_per_epoch: 12
+average:
+  decay: 0.9
+"""
+
+
+@pytest.fixture
+def tiny_config(tmp_path, monkeypatch, recording):
+    """Config of a training that takes a second, in an empty working folder."""
+    monkeypatch.chdir(tmp_path)
+    path = tmp_path / "tiny.yaml"
+    path.write_text(TINY.replace("{root}", str(recording)))
+    return str(path)

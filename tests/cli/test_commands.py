@@ -1,0 +1,128 @@
+import json
+from pathlib import Path
+
+import pytest
+import torch
+from PIL import Image
+
+from ugr_lightning.cli.commands import seed_list
+from ugr_lightning.cli.main import main
+from ugr_lightning.contract import EpisodeResult
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.rollout.noise import Noise
+
+
+@pytest.fixture
+def world(monkeypatch):
+    """Rollouts without a simulator; returns the calls."""
+    calls = []
+
+    def run_episodes(actor, task, seeds, *, on_result, video_dir, execution, **options):
+        calls.append({"actor": actor.name, "task": task, "seeds": seeds, "execution": execution, **options})
+        results = []
+        for seed in seeds:
+            result = EpisodeResult(
+                task, "demo_clean", seed, "hash", actor.name, None, str(execution), seed % 2 == 0, 10
+            )
+            if video_dir and seed == seeds[0]:
+                result.video = str(Path(video_dir) / "a.gif")
+                Image.new("RGB", (4, 4)).save(result.video)
+            if on_result is not None:
+                on_result(result, None)
+            results.append(result)
+        return results
+
+    monkeypatch.setattr("ugr_lightning.rollout.runner.run_episodes", run_episodes)
+    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", lambda: None)
+    return calls
+
+
+def test_rollout_prints_rate_and_interval_and_writes_a_line_per_episode(world, tmp_path, capsys):
+    out = tmp_path / "results.jsonl"
+    command = "rollout --policy zero --task click_alarmclock --seeds 300000 --episodes 4 --execution 25 --out".split()
+    assert main([*command, str(out)]) == 0
+    said = capsys.readouterr().out
+    assert "2/4" in said
+    assert "[15.0%, 85.0%]" in said
+    assert [json.loads(line)["seed"] for line in out.read_text().splitlines()] == [300000, 300001, 300002, 300003]
+    assert world[0]["execution"] == 25
+
+
+def test_only_a_video_means_one_episode(world, tmp_path):
+    gif = tmp_path / "out.gif"
+    assert main(["rollout", "--policy", "expert", "--task", "handover_block", "--video", str(gif)]) == 0
+    assert Image.open(gif).format == "GIF"
+    assert len(world[0]["seeds"]) == 1
+
+
+def test_a_policy_that_is_neither_a_name_nor_a_file_is_explained(world, capsys):
+    assert main(["rollout", "--policy", "exprt", "--task", "click_alarmclock"]) == 2
+    assert "expert" in capsys.readouterr().err
+
+
+def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seeds(world, tiny_config, capsys):
+    assert main(["fit", "--config", tiny_config]) == 0
+    assert main(["test", "--episodes", "3"]) == 0
+    assert "policy_best.ckpt" in capsys.readouterr().out
+    assert [call["execution"] for call in world] == ["aggregate", 25]
+    assert all(call["seeds"][0] >= 100000 and call["image_size"] == (8, 12) for call in world)
+    assert world[0]["checkpoint"] is not None
+    assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
+
+
+def test_seed_lists_are_what_they_say():
+    evaluation, whole = seed_list("evaluation", "click_alarmclock", 5)
+    assert evaluation == whole[:5]
+    assert len(whole) == 100
+    assert seed_list("selection", "click_alarmclock", 2)[0] == [200000, 200001]
+    assert seed_list(7, "click_alarmclock", 2)[0] == [7, 8]
+    with pytest.raises(ConfigError, match="at most the 100"):
+        seed_list("evaluation", "click_alarmclock", 101)
+
+
+def test_collect_hands_its_options_on(monkeypatch, capsys):
+    calls = []
+    monkeypatch.setattr(
+        "ugr_lightning.rollout.collect.collect", lambda task, folder, **options: calls.append((task, folder, options))
+    )
+    command = (
+        "collect --task handover_block --episodes 3 --root d --image_size [6,8] --noise.std 0.01 --workers 1".split()
+    )
+    assert main(command) == 0
+    [(task, folder, options)] = calls
+    assert (task, folder) == ("handover_block", Path("d/handover_block/demo_clean"))
+    assert options["noise"] == Noise(std=0.01)
+    assert (options["episodes"], options["image_size"], options["workers"]) == (3, (6, 8), 1)
+
+
+def test_a_typo_in_an_option_is_named(capsys):
+    assert main(["rollout", "--polic", "zero"]) == 2
+    assert "`policy`" in capsys.readouterr().err
+
+
+def test_tasks_lists_them(capsys):
+    assert main(["tasks"]) == 0
+    assert "handover_block" in capsys.readouterr().out
+
+
+def test_inspect_tells_what_things_are(recording, tiny_config, capsys, tmp_path):
+    folder = recording / "click_alarmclock" / "demo_clean"
+    assert main(["inspect", str(folder)]) == 0
+    assert "5 demonstrations" in capsys.readouterr().out
+    assert main(["inspect", str(folder / "data" / "episode1.hdf5"), "--picture", "sheet.png"]) == 0
+    assert "12 decision steps" in capsys.readouterr().out
+    assert Image.open("sheet.png").size == (3 * 12, 8 * 8)
+    assert main(["fit", "--config", tiny_config]) == 0
+    assert main(["inspect", "runs"]) == 0
+    assert main(["inspect", "runs/tiny/version_0/last.ckpt"]) == 0
+    out = capsys.readouterr().out
+    assert "tiny.TinyPolicy" in out
+    assert "cam_left_wrist" in out
+
+
+def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):
+    torch.save([1], tmp_path / "list.ckpt")
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "list.ckpt", tmp_path / "none", tmp_path / "empty"):
+        assert main(["inspect", str(path)]) == 2
+        assert path.name in capsys.readouterr().err

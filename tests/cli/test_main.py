@@ -1,0 +1,59 @@
+import subprocess
+import sys
+
+import pytest
+
+from ugr_lightning.cli import main as entry
+from ugr_lightning.cli.main import COMMANDS, main
+from ugr_lightning.errors import DataError
+
+
+def test_ugr_alone_prints_the_first_run_path(capsys):
+    assert main([]) == 0
+    out = capsys.readouterr().out
+    assert "ugr fit --config configs/uncert.yaml" in out
+    assert all(command in out for command in COMMANDS)
+
+
+def test_an_unknown_command_names_the_closest_one(capsys):
+    assert main(["rolout"]) == 2
+    assert "Did you mean `ugr rollout`?" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", sorted(COMMANDS))
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as done:
+        main([command, "--help"])
+    assert done.value.code in (0, None)
+    assert "usage" in capsys.readouterr().out.lower()
+
+
+def test_a_problem_of_the_user_is_one_paragraph_and_a_traceback_only_on_request(monkeypatch, capsys):
+    def fail(command, arguments):
+        raise DataError("episode0.hdf5", "the key `state`", "no such key", "Record it again.")
+
+    monkeypatch.setattr(entry, "_run", fail)
+    assert main(["fit"]) == 2
+    said = capsys.readouterr().err
+    assert "episode0.hdf5: expected the key `state`, got no such key. Record it again." in said
+    assert "Traceback" not in said
+    monkeypatch.setenv("UGR_DEBUG", "1")
+    with pytest.raises(DataError):
+        main(["fit"])
+
+
+def test_an_interrupt_is_exit_code_130(monkeypatch):
+    def interrupt(command, arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(entry, "_run", interrupt)
+    assert main(["fit"]) == 130
+
+
+def test_training_works_where_no_simulator_is_installed():
+    program = """
+import sys
+sys.modules.update({name: None for name in ("sapien", "mani_skill", "gymnasium")})
+import ugr_lightning.cli.fit, ugr_lightning.cli.commands, ugr_lightning.training.callbacks.rollout
+"""
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120)
