@@ -1,6 +1,7 @@
 """The subcommands of `ugr` that are one typed function each; jsonargparse turns their signatures into options."""
 
 import argparse
+import inspect
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ def call(function: Callable[..., int], command: str, argv: Sequence[str]) -> int
     """Parse a command line by the signature of a function and call it.
 
     Args:
-        function: its parameters become options; those without a default are positional.
+        function: its parameters become options; those without a default are required.
         command: name of the subcommand.
         argv: what follows it.
 
@@ -28,16 +29,17 @@ def call(function: Callable[..., int], command: str, argv: Sequence[str]) -> int
     """
     summary = (function.__doc__ or "").split("\n", 1)[0]
     parser = ArgumentParser(prog=f"ugr {command}", description=summary, exit_on_error=False, allow_abbrev=False)
-    parser.add_function_arguments(function, as_group=False, as_positional=True, sub_configs=True)
-    parser.add_argument("--config", action="config", help="YAML file with options")
+    parser.add_function_arguments(function, as_group=False, as_positional=False, sub_configs=True)
+    if "config" not in inspect.signature(function).parameters:
+        parser.add_argument("--config", action="config", help="YAML file with options")
     try:
         options = parser.instantiate_classes(parser.parse_args(list(argv)))
     except argparse.ArgumentError as error:
         if isinstance(error.__cause__ or error.__context__, UGRError):
             raise (error.__cause__ or error.__context__) from None  # type: ignore[misc]
         raise explain(error, parser) from None
-    options.pop("config", None)
-    return function(**options.as_dict())
+    given = {name: options[name] for name in inspect.signature(function).parameters}
+    return function(**given)
 
 
 def _collect(

@@ -14,6 +14,8 @@ def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr inspect`."""
     from ugr_lightning.cli.commands import call
 
+    if argv and not argv[0].startswith("-"):  # `ugr inspect PATH`
+        argv = ["--path", *argv]
     return call(_inspect, command, argv)
 
 

@@ -11,7 +11,11 @@ FILES = {"best": "policy_best.ckpt", "best_loss": "policy_best_loss.ckpt", "last
 
 def versions_of(folder: Path) -> list[Path]:
     """The runs in a folder, oldest first."""
-    found = [(int(match[1]), path) for path in folder.glob("version_*") if (match := re.fullmatch(r"version_(\d+)", path.name))]
+    found = [
+        (int(match[1]), path)
+        for path in folder.glob("version_*")
+        if (match := re.fullmatch(r"version_(\d+)", path.name))
+    ]
     return [path for _, path in sorted(found)]
 
 
