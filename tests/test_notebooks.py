@@ -1,0 +1,40 @@
+"""Every notebook runs from top to bottom as its reader would run it, and is committed without outputs."""
+
+import os
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+FOLDER = Path(__file__).parents[1] / "notebooks"
+NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
+CELL_TIMEOUT_S = 700  # longer than two attempts to start a simulator, which then says itself what is wrong
+
+each_notebook = pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+
+
+def test_there_are_notebooks():
+    assert NOTEBOOKS
+
+
+@pytest.mark.renders
+@each_notebook
+def test_notebook_runs_and_leaves_nothing_behind(path, tmp_path):
+    before = sorted(FOLDER.iterdir())
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": str(FOLDER)}}
+    client = NotebookClient(notebook, timeout=CELL_TIMEOUT_S, kernel_name="python3", resources=place)
+    settings = {"OMP_NUM_THREADS": "1", "IPYTHONDIR": str(tmp_path / "ipython"), "TMPDIR": str(tmp_path)}
+    client.execute(env={**os.environ, **settings})
+    assert sorted(FOLDER.iterdir()) == before
+    assert not list(tmp_path.glob("ugr-*"))  # the workspace went away with the kernel
+
+
+@each_notebook
+def test_notebook_is_valid_and_committed_without_outputs(path):
+    notebook = nbformat.read(path, as_version=4)
+    nbformat.validate(notebook)
+    cells = [cell for cell in notebook.cells if cell.cell_type == "code"]
+    assert all(not cell.outputs and cell.execution_count is None for cell in cells)
+    assert path.stat().st_size < 200_000
