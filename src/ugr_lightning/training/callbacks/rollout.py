@@ -133,7 +133,6 @@ class RolloutEvaluation(Callback):
             workers=self.workers,
             on_result=keep,
             video_dir=videos if self.video else None,
-            video_seeds=[SELECTION_START],
             video_seeds=seeds[:1],
             progress=False,
         )
