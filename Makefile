@@ -5,7 +5,6 @@ SHELL := /bin/bash
 export PYTHON ?= python3.11
 export VENV ?= .venv
 export TORCH_INDEX ?= auto
-export DEBIAN_MIRROR ?= http://deb.debian.org/debian
 JOBS ?= 2
 ARGS ?=
 BIN := $(VENV)/bin

@@ -11,7 +11,7 @@
 # an installation was begun and failed.
 set -euo pipefail
 cd "$(dirname "$0")/.."
-: "${VENV:=.venv}" "${DEBIAN_MIRROR:=http://deb.debian.org/debian}"
+: "${VENV:=.venv}"
 STAMP=${1:-}
 PACKAGES=(mesa-vulkan-drivers libvulkan1 libx11-6)
 BACKPORTS=/etc/apt/sources.list.d/bookworm-backports.list
@@ -32,6 +32,11 @@ done_with() {
   exit 0
 }
 
+# Prints the Debian mirror that this machine uses already; backports are on every one.
+mirror() {
+  apt-get --no-release-info indextargets --format '$(REPO_URI) $(RELEASE)' | awk '$2 == "bookworm" && !found++ {print $1}'
+}
+
 # Prints the apt-get arguments for this system, or nothing where stock packages cannot help.
 apt_arguments() {
   local id version
@@ -49,7 +54,7 @@ explain() {
   sed 's/^/    /' <<<"$2" | tail -5
   printf '[vulkan] To get the software driver (no GPU needed):\n'
   if [[ $arguments == *backports* ]]; then
-    printf "    echo 'deb %s bookworm-backports main' | sudo tee %s\n" "$DEBIAN_MIRROR" "$BACKPORTS"
+    printf "    echo 'deb %s bookworm-backports main' | sudo tee %s\n" "$(mirror)" "$BACKPORTS"
   fi
   if [ -n "$arguments" ]; then
     printf '    sudo apt-get update && sudo apt-get install --no-install-recommends %s\n' "$arguments"
@@ -67,7 +72,7 @@ install_driver() {
   export DEBIAN_FRONTEND=noninteractive
   if [[ $arguments == *backports* ]] && ! apt-cache policy | grep -q bookworm-backports; then
     say "adding $BACKPORTS (Debian 12's own Mesa 22 is too old)"
-    echo "deb $DEBIAN_MIRROR bookworm-backports main" >"$BACKPORTS"
+    echo "deb $(mirror) bookworm-backports main" >"$BACKPORTS"
   fi
   say "installing system packages: apt-get install --no-install-recommends $arguments"
   # shellcheck disable=SC2086  # the arguments are meant to be split
