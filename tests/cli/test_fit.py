@@ -40,6 +40,7 @@ def test_fit_leaves_config_logs_and_checkpoints_and_a_second_one_disturbs_nothin
     tags = EventAccumulator(str(RUN)).Reload().Tags()
     assert {"train/loss", "val/loss", "val/action_error", "train/learning_rate"} <= set(tags["scalars"])
     assert "figures/chunk" in tags["images"]
+    assert "hp/val/action_error" in tags["scalars"]
     assert not weights(RUN)["policy.head.weight"].equal(weights(RUN.parent / "version_1")["policy.head.weight"])
 
 
@@ -60,6 +61,21 @@ def test_a_fit_that_goes_on_from_last_equals_the_uninterrupted_one(tiny_config, 
     assert all(torch.equal(a[name], b[name]) for name in a)
     assert scores(RUN) == scores(straight)
     assert not (RUN.parent / "version_1").exists(), "it went on in its own folder"
+
+
+def test_an_interrupt_ends_with_130_and_leaves_a_checkpoint_to_go_on_from(tiny_config, monkeypatch):
+    from tiny import TinyPolicy
+
+    losses = TinyPolicy.losses
+
+    def interrupted(self, batch):
+        if self.calls == 4:
+            raise KeyboardInterrupt
+        return losses(self, batch)
+
+    monkeypatch.setattr(TinyPolicy, "losses", interrupted)
+    assert main(["fit", "--config", tiny_config]) == 130
+    assert torch.load(RUN / "last.ckpt", weights_only=True)["global_step"] == 3
 
 
 def test_validate_scores_the_checkpoint_it_names(tiny_config, capsys):

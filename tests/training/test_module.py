@@ -16,7 +16,7 @@ def run(tmp_path_factory):
 
 
 def test_every_loss_term_and_score_is_logged(run):
-    trainer, folder = run
+    _, folder = run
     logged = set(next(csv.reader((folder / "metrics.csv").open())))
     expected = {
         "train/loss",

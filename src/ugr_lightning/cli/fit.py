@@ -11,8 +11,10 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from lightning.pytorch import Callback, Trainer
+import yaml
+from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.cli import LightningArgumentParser, LightningCLI, SaveConfigCallback
+from lightning.pytorch.loggers import TensorBoardLogger
 
 from ugr_lightning.cli.config import expand_includes, explain, run_name
 from ugr_lightning.cli.runs import next_version, resolve_checkpoint
@@ -28,7 +30,30 @@ from ugr_lightning.training.checkpoint import AtomicCheckpointIO, read_checkpoin
 from ugr_lightning.training.loggers import run_loggers
 from ugr_lightning.training.module import PolicyModule
 
+_SCORES = ("rollout/success_rate", "val/action_error", "val/loss")
 _RUN_FOLDER = "UGR_RUN_FOLDER"  # tells the other processes of a distributed run which folder the first one chose
+
+
+class RunRecord(SaveConfigCallback):
+    """Leaves `config.yaml` in the run's folder, and its values beside the final scores in TensorBoard's HPARAMS."""
+
+    def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Log the hyper-parameters with success as a metric, where there were rollouts."""
+        values = _flat(yaml.safe_load(self.parser.dump(self.config, skip_none=False)))
+        scores = {f"hp/{name}": trainer.callback_metrics[name] for name in _SCORES if name in trainer.callback_metrics}
+        for logger in trainer.loggers:
+            if isinstance(logger, TensorBoardLogger):
+                logger.log_hyperparams(values, scores, trainer.global_step)
+
+
+def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for name, value in tree.items():
+        if isinstance(value, dict):
+            flat |= _flat(value, f"{prefix}{name}.")
+        else:
+            flat[prefix + name] = value if isinstance(value, (bool, int, float, str)) else str(value)
+    return flat
 
 
 class UGRCLI(LightningCLI):
@@ -45,7 +70,7 @@ class UGRCLI(LightningCLI):
         super().__init__(
             PolicyModule,
             ChunkDataModule,
-            save_config_callback=SaveConfigCallback,
+            save_config_callback=RunRecord,
             save_config_kwargs={"overwrite": True},
             trainer_defaults={
                 "default_root_dir": "runs",
@@ -162,7 +187,12 @@ def run(command: str, argv: Sequence[str]) -> int:
     torch.set_num_threads(
         max(1, len(os.sched_getaffinity(0))) if "OMP_NUM_THREADS" not in os.environ else torch.get_num_threads()
     )
-    UGRCLI([command, *expand_includes(argv)], run_name(argv))
+    try:
+        UGRCLI([command, *expand_includes(argv)], run_name(argv))
+    except SystemExit as stop:
+        if isinstance(stop.__context__, KeyboardInterrupt):  # Lightning has shut down and exits with 1
+            raise KeyboardInterrupt from None
+        raise
     return 0
 
 
