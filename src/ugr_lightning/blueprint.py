@@ -32,7 +32,7 @@ class Blueprinted:
                 object.__setattr__(self, "_blueprint", {"class_path": path, "init_args": given})
             build(self, *args, **kwargs)
 
-        cls.__init__ = recording_init  # type: ignore[method-assign]
+        cls.__init__ = recording_init  # type: ignore[assignment]
 
     def blueprint(self) -> dict[str, Any]:
         """The class and the arguments this object was built with, as plain containers."""

@@ -126,3 +126,14 @@ def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):
     for path in (tmp_path / "list.ckpt", tmp_path / "none", tmp_path / "empty"):
         assert main(["inspect", str(path)]) == 2
         assert path.name in capsys.readouterr().err
+
+
+def test_a_yes_or_no_option_works_as_a_plain_flag(capsys):
+    def act(quick: bool = False, count: int = 1) -> int:
+        """Act."""
+        print(quick, count)
+        return 0
+
+    for argv in (["--quick", "--count", "3"], ["--quick"], ["--quick", "false"], []):
+        commands.call(act, "act", argv)
+    assert capsys.readouterr().out.splitlines() == ["True 3", "True 1", "False 1", "False 1"]

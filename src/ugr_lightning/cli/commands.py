@@ -30,6 +30,9 @@ def call(function: Callable[..., int], command: str, argv: Sequence[str]) -> int
     summary = (function.__doc__ or "").split("\n", 1)[0]
     parser = ArgumentParser(prog=f"ugr {command}", description=summary, exit_on_error=False, allow_abbrev=False)
     parser.add_function_arguments(function, as_group=False, as_positional=False, sub_configs=True)
+    for action in parser._actions:
+        if getattr(action, "_typehint", None) is bool:
+            action.nargs, action.const = "?", True  # `--quick` alone means `--quick true`
     if "config" not in inspect.signature(function).parameters:
         parser.add_argument("--config", action="config", help="YAML file with options")
     try:
