@@ -5,7 +5,7 @@ import pytest
 import torch
 from PIL import Image
 
-from ugr_lightning.cli.commands import seed_list
+from ugr_lightning.cli.commands import call, seed_list
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
@@ -135,5 +135,5 @@ def test_a_yes_or_no_option_works_as_a_plain_flag(capsys):
         return 0
 
     for argv in (["--quick", "--count", "3"], ["--quick"], ["--quick", "false"], []):
-        commands.call(act, "act", argv)
+        call(act, "act", argv)
     assert capsys.readouterr().out.splitlines() == ["True 3", "True 1", "False 1", "False 1"]
