@@ -146,7 +146,7 @@ def measure_query(size: Size) -> Iterator[Measurement]:
         reference(pixels, batch.state, latent)
 
     runs: dict[str, Callable[[], Any]] = {
-        "ours": partial(policy.predict, observation),
+        "ours": partial(policy.for_inference().predict, observation),  # as rollouts query it
         "reference": reference_query,
     }
     paces = take_turns(runs, 3 * size.rounds)

@@ -103,6 +103,7 @@ class UGRCLI(LightningCLI):
         parser.add_lightning_class_args(RolloutEvaluation, "rollout")
         parser.add_lightning_class_args(ValidationFigures, "figures")
         parser.set_defaults({"model.policy": {"class_path": "ugr_lightning.models.act.ACT"}})
+        parser.link_arguments("seed_everything", "data.seed", int)  # one seed names a training
         parser.link_arguments("model", "data.cameras", lambda module: list(module.policy.cameras), "instantiate")
         parser.link_arguments("model", "data.chunk_length", lambda module: module.policy.chunk_length, "instantiate")
 
