@@ -11,6 +11,8 @@ from ugr_lightning.contract import Batch, Chunk
 from ugr_lightning.training.module import PolicyModule
 from ugr_lightning.training.tensorboard import log_figure
 
+SMALLEST_SPAN = 0.2  # of an action's axis, rad or gripper opening
+
 
 class ValidationFigures(Callback):
     """Draws figures of the validation for TensorBoard.
@@ -89,6 +91,9 @@ def chunk_figure(batch: Batch, chunk: Chunk, sample: int = 0) -> Figure:
         if chunk.refined is not None:
             for k in torch.nonzero(chunk.refined[sample, :length]).flatten().tolist():
                 axis.axvspan(k - 0.5, k + 0.5, color="tab:orange", alpha=0.15, lw=0)
+        low, high = axis.get_ylim()
+        if high - low < SMALLEST_SPAN:  # an arm at rest shall look like one
+            axis.set_ylim((low + high - SMALLEST_SPAN) / 2, (low + high + SMALLEST_SPAN) / 2)
         axis.set_title(f"action {dim}", fontsize=8)
         axis.tick_params(labelsize=7)
     axes.flat[0].legend(fontsize=7)
