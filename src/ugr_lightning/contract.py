@@ -134,6 +134,7 @@ class EpisodeResult:
         success: whether the task's condition was met before the horizon; a crashed episode has False.
         steps: control steps executed.
         first_success_step: first step at which the condition was met, or None.
+        motion_hash: SHA-256 of the measured joints of all steps; equal for episodes that went the same way bit for bit.
         log_variance: summary of s_k over the episode (mean, max), empty where the policy has none.
         seconds: wall-clock seconds by part (`query`, `simulate`).
         video: path of the recorded video, or None.
@@ -150,6 +151,7 @@ class EpisodeResult:
     success: bool
     steps: int
     first_success_step: int | None = None
+    motion_hash: str | None = None
     log_variance: dict[str, float] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     video: str | None = None

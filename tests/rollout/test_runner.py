@@ -61,6 +61,12 @@ def test_results_depend_on_the_seeds_and_not_on_slots_or_history(runner):
     assert alone == backwards[::-1] == many
 
 
+def test_the_motion_hash_tells_episodes_apart_and_knows_a_repetition(runner):
+    first, other = (runner.run("random", [seed], progress=False)[0].motion_hash for seed in (7, 8))
+    assert first == runner.run("random", [7], progress=False)[0].motion_hash
+    assert first != other
+
+
 def test_every_query_has_the_full_batch_as_uint8_without_a_copy_to_channels_first(runner):
     policy = Reacher()
     policy.train()

@@ -1,5 +1,6 @@
 """The control loop over all slots at once, and what it keeps of each episode."""
 
+import hashlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -35,6 +36,10 @@ class EpisodeTrace:
     actions: list[np.ndarray | None] = field(default_factory=list)
     log_variance: list[np.ndarray | None] = field(default_factory=list)
     images: list[np.ndarray] = field(default_factory=list)
+
+    def motion_hash(self) -> str:
+        """SHA-256 of the measured joints of all frames."""
+        return hashlib.sha256(b"".join(np.asarray(frame.measured).tobytes() for frame in self.frames)).hexdigest()
 
     def video(self, every: int = 1) -> np.ndarray:
         """The filmed pictures with step, success and uncertainty drawn in, (T, H', W', 3) uint8."""
@@ -186,6 +191,7 @@ class LockStep:
             success=success,
             steps=episode.steps,
             first_success_step=episode.steps if success else None,
+            motion_hash=episode.trace.motion_hash(),
             log_variance={"mean": float(np.mean(known)), "max": float(np.max(known))} if known else {},
             seconds={"query": round(episode.query, 4), "simulate": round(episode.simulate, 4)},
             crash=crash,
