@@ -77,22 +77,22 @@ class HandoverBlock(TwoArmEnv):
     def _meet(self, arms: Arms) -> Iterator[ExpertStep]:
         left = TcpPose(np.array([-0.075, 0.0, MEETING_HEIGHT]), gripper_level(facing("left")))
         right = TcpPose(np.array([0.2, 0.0, MEETING_HEIGHT]), gripper_level(facing("right")))
-        yield from arms.move({"left": left, "right": right}, steps=44, phase="meet", slack=(1.0, 1.0, 0.0, 0.0))
+        yield from arms.move({"left": left, "right": right}, steps=44, phase="meet", slack=(1.0, 1.0, 0.4, 0.4))
         centre, rotation = self.block_pose()
         axis = rotation[:, 2] * (1.0 if rotation[0, 2] > 0 else -1.0)
         end = TcpPose(centre + axis * GRASP, right.rotation)
-        yield from arms.move({"right": end}, steps=26, phase="approach", slack=(0.0,))
+        yield from arms.move({"right": end}, steps=26, phase="approach", slack=(0.4, 0.2, 0.0))
         yield from arms.grip({"right": 0.0}, steps=10, phase="grasp-right")
         yield from arms.grip({"left": 1.0}, steps=8, phase="release-left")
         back = TcpPose(np.array([-0.2, 0.0, MEETING_HEIGHT]), left.rotation)
-        yield from arms.move({"left": back}, steps=20, phase="retreat", slack=(0.0,), overlap=6)
+        yield from arms.move({"left": back}, steps=20, phase="retreat", slack=(0.0, 0.2, 0.6), overlap=6)
 
     def _place(self, arms: Arms) -> Iterator[ExpertStep]:
         down = gripper_down(facing("right"))
         goals: dict[str, TcpPose | Array] = {"right": self._placing(down, 0.06), "left": HOME}
-        yield from arms.move(goals, steps=48, phase="carry", slack=(0.0, 1.0, 1.0, 0.0))
+        yield from arms.move(goals, steps=48, phase="carry", slack=(0.6, 1.0, 1.0, 0.5))
         lower = self._placing(down, 0.004)
-        yield from arms.move({"right": lower}, steps=26, phase="lower", slack=(0.0,))
+        yield from arms.move({"right": lower}, steps=26, phase="lower", slack=(0.5, 0.2, 0.0))
         yield from arms.grip({"right": 1.0}, steps=12, phase="release-right")
 
     def _placing(self, rotation: Array, height: float) -> TcpPose:
