@@ -9,7 +9,7 @@ from typing import NamedTuple
 import pytest
 import torch
 
-from ugr_lightning.cli import commands, main
+from ugr_lightning.cli import call, main
 from ugr_lightning.models.refine.selector import Selector
 
 ROOT = Path(__file__).parents[1]
@@ -68,7 +68,7 @@ def test_ugr_command_is_known_and_its_options_parse(line, monkeypatch, capsys):
     def stop(*_args, **_options):
         raise ParsedError
 
-    monkeypatch.setattr(commands.ArgumentParser, "instantiate_classes", stop)
+    monkeypatch.setattr(call.ArgumentParser, "instantiate_classes", stop)
     monkeypatch.setattr("ugr_lightning.cli.fit.UGRCLI._parse_ckpt_path", stop)
     monkeypatch.chdir(ROOT)
     words = shlex.split(line)[1:]

@@ -1,4 +1,4 @@
-from ugr_lightning.cli import commands
+from ugr_lightning.cli import rollout
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import EpisodeResult
 
@@ -11,7 +11,7 @@ def test_demo_trains_evaluates_and_ends_with_a_table(tiny_config, monkeypatch, c
         name = policy if policy in ("zero", "expert") else "TinyPolicy"
         return [EpisodeResult(task, "demo_clean", 100000, "h", name, None, str(execution), name == "expert", 5)]
 
-    monkeypatch.setattr(commands, "roll_out", roll_out)
+    monkeypatch.setattr(rollout, "roll_out", roll_out)
     assert main(["demo", "--config", f"[{tiny_config}]", "--episodes", "12"]) == 0
     assert asked[0] == ("zero", "click_alarmclock", "evaluation", 10, "aggregate")
     assert asked[2:] == [

@@ -11,7 +11,7 @@ from ugr_lightning.errors import ConfigError
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr demo`."""
-    from ugr_lightning.cli.commands import call
+    from ugr_lightning.cli.call import call
 
     return call(_demo, command, argv)
 
@@ -33,7 +33,7 @@ def _demo(
         run: name of the run.
     """
     from ugr_lightning.cli import fit
-    from ugr_lightning.cli.commands import roll_out
+    from ugr_lightning.cli.rollout import roll_out
     from ugr_lightning.cli.runs import resolve_checkpoint, versions_of
     from ugr_lightning.rollout.results import success_table
 

@@ -12,7 +12,7 @@ from ugr_lightning.errors import DataError
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr inspect`."""
-    from ugr_lightning.cli.commands import call
+    from ugr_lightning.cli.call import call
 
     if argv and not argv[0].startswith("-"):  # `ugr inspect PATH`
         argv = ["--path", *argv]

@@ -14,8 +14,8 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "collect": ("ugr_lightning.cli.commands:run", "record demonstrations of a task's scripted expert"),
     "fit": ("ugr_lightning.cli.fit:run", "train a policy; records missing demonstrations first"),
     "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
-    "test": ("ugr_lightning.cli.commands:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
-    "rollout": ("ugr_lightning.cli.commands:run", "let a checkpoint, or zero, random or expert, act in a task"),
+    "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
+    "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
     "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
     "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }

@@ -5,8 +5,9 @@ import pytest
 import torch
 from PIL import Image
 
-from ugr_lightning.cli.commands import call, seed_list
+from ugr_lightning.cli.call import call
 from ugr_lightning.cli.main import main
+from ugr_lightning.cli.rollout import seed_list
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.rollout.noise import Noise
