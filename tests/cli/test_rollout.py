@@ -2,15 +2,12 @@ import json
 from pathlib import Path
 
 import pytest
-import torch
 from PIL import Image
 
-from ugr_lightning.cli.call import call
 from ugr_lightning.cli.main import main
 from ugr_lightning.cli.rollout import seed_list
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
-from ugr_lightning.rollout.noise import Noise
 
 
 @pytest.fixture
@@ -81,60 +78,6 @@ def test_seed_lists_are_what_they_say():
         seed_list("evaluation", "click_alarmclock", 101)
 
 
-def test_collect_hands_its_options_on(monkeypatch, capsys):
-    calls = []
-    monkeypatch.setattr(
-        "ugr_lightning.rollout.collect.collect", lambda task, folder, **options: calls.append((task, folder, options))
-    )
-    command = (
-        "collect --task handover_block --episodes 3 --root d --image_size [6,8] --noise.std 0.01 --workers 1".split()
-    )
-    assert main(command) == 0
-    [(task, folder, options)] = calls
-    assert (task, folder) == ("handover_block", Path("d/handover_block/demo_clean"))
-    assert options["noise"] == Noise(std=0.01)
-    assert (options["episodes"], options["image_size"], options["workers"]) == (3, (6, 8), 1)
-
-
 def test_a_typo_in_an_option_is_named(capsys):
     assert main(["rollout", "--polic", "zero"]) == 2
     assert "`policy`" in capsys.readouterr().err
-
-
-def test_tasks_lists_them(capsys):
-    assert main(["tasks"]) == 0
-    assert "handover_block" in capsys.readouterr().out
-
-
-def test_inspect_tells_what_things_are(recording, tiny_config, capsys, tmp_path):
-    folder = recording / "click_alarmclock" / "demo_clean"
-    assert main(["inspect", str(folder)]) == 0
-    assert "5 demonstrations" in capsys.readouterr().out
-    assert main(["inspect", str(folder / "data" / "episode1.hdf5"), "--picture", "sheet.png"]) == 0
-    assert "12 decision steps" in capsys.readouterr().out
-    assert Image.open("sheet.png").size == (3 * 12, 8 * 8)
-    assert main(["fit", "--config", tiny_config]) == 0
-    assert main(["inspect", "runs"]) == 0
-    assert main(["inspect", "runs/tiny/version_0/last.ckpt"]) == 0
-    out = capsys.readouterr().out
-    assert "tiny.TinyPolicy" in out
-    assert "cam_left_wrist" in out
-
-
-def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):
-    torch.save([1], tmp_path / "list.ckpt")
-    (tmp_path / "empty").mkdir()
-    for path in (tmp_path / "list.ckpt", tmp_path / "none", tmp_path / "empty"):
-        assert main(["inspect", str(path)]) == 2
-        assert path.name in capsys.readouterr().err
-
-
-def test_a_yes_or_no_option_works_as_a_plain_flag(capsys):
-    def act(quick: bool = False, count: int = 1) -> int:
-        """Act."""
-        print(quick, count)
-        return 0
-
-    for argv in (["--quick", "--count", "3"], ["--quick"], ["--quick", "false"], []):
-        call(act, "act", argv)
-    assert capsys.readouterr().out.splitlines() == ["True 3", "True 1", "False 1", "False 1"]

@@ -1,0 +1,27 @@
+import torch
+from PIL import Image
+
+from ugr_lightning.cli.main import main
+
+
+def test_inspect_tells_what_things_are(recording, tiny_config, capsys, tmp_path):
+    folder = recording / "click_alarmclock" / "demo_clean"
+    assert main(["inspect", str(folder)]) == 0
+    assert "5 demonstrations" in capsys.readouterr().out
+    assert main(["inspect", str(folder / "data" / "episode1.hdf5"), "--picture", "sheet.png"]) == 0
+    assert "12 decision steps" in capsys.readouterr().out
+    assert Image.open("sheet.png").size == (3 * 12, 8 * 8)
+    assert main(["fit", "--config", tiny_config]) == 0
+    assert main(["inspect", "runs"]) == 0
+    assert main(["inspect", "runs/tiny/version_0/last.ckpt"]) == 0
+    out = capsys.readouterr().out
+    assert "tiny.TinyPolicy" in out
+    assert "cam_left_wrist" in out
+
+
+def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):
+    torch.save([1], tmp_path / "list.ckpt")
+    (tmp_path / "empty").mkdir()
+    for path in (tmp_path / "list.ckpt", tmp_path / "none", tmp_path / "empty"):
+        assert main(["inspect", str(path)]) == 2
+        assert path.name in capsys.readouterr().err
