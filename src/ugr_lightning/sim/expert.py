@@ -76,10 +76,11 @@ class Arms:
     Args:
         command: (14,) command in force.
         speed: divides the duration of every motion.
+        base_height: of the arms' bases above the table top, metres.
     """
 
-    def __init__(self, command: np.ndarray, speed: float = 1.0) -> None:
-        self.speed = speed
+    def __init__(self, command: np.ndarray, speed: float = 1.0, base_height: float = 0.0) -> None:
+        self.speed, self.base_height = speed, base_height
         self.joints: dict[str, Array] = {
             s: np.array(command[i : i + 6], float) for s, i in zip(SIDES, (0, 7), strict=True)
         }
@@ -89,7 +90,7 @@ class Arms:
 
     def pose(self, side: str) -> TcpPose:
         """World tool pose at which the motions commanded so far end."""
-        return to_world(side, forward(self._end(side)))
+        return to_world(side, forward(self._end(side)), self.base_height)
 
     def move(
         self,
@@ -159,7 +160,7 @@ class Arms:
         before = self._coming[side][:count]
         before = before + [end] * (count - len(before))
         if isinstance(goal, TcpPose):
-            target = to_base(side, goal)
+            target = to_base(side, goal, self.base_height)
             posture = inverse(target, end, prefer_small_rolls=_ROLL_WEIGHT)
             straight = _straight_line(before, target, self.joints[side])
             if straight is not None and np.abs(straight[-1] - posture).max() < _BRANCH_TOLERANCE:

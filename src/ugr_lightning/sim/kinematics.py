@@ -96,16 +96,16 @@ def base_position(side: str) -> Array:
     return np.array([-BASE_X if side == "left" else BASE_X, 0.0, 0.0])
 
 
-def to_base(side: str, pose: TcpPose) -> TcpPose:
-    """Express a world pose in an arm's base frame."""
-    inverse = base_rotation(side).T
-    return TcpPose(inverse @ (pose.position - base_position(side)), inverse @ pose.rotation)
+def to_base(side: str, pose: TcpPose, base_height: float = 0.0) -> TcpPose:
+    """Express a world pose in the frame of an arm's base, which stands `base_height` metres above the table top."""
+    inverse, base = base_rotation(side).T, base_position(side) + base_height * UP
+    return TcpPose(inverse @ (pose.position - base), inverse @ pose.rotation)
 
 
-def to_world(side: str, pose: TcpPose) -> TcpPose:
-    """Express a pose of an arm's base frame in the world."""
-    rotation = base_rotation(side)
-    return TcpPose(base_position(side) + rotation @ pose.position, rotation @ pose.rotation)
+def to_world(side: str, pose: TcpPose, base_height: float = 0.0) -> TcpPose:
+    """Express a pose of the frame of an arm's base in the world; see `to_base`."""
+    rotation, base = base_rotation(side), base_position(side) + base_height * UP
+    return TcpPose(base + rotation @ pose.position, rotation @ pose.rotation)
 
 
 def forward(joints: Array) -> TcpPose:

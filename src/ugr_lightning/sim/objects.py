@@ -10,8 +10,8 @@ from mani_skill.utils.building.actor_builder import ActorBuilder
 from mani_skill.utils.structs import Actor
 
 from ugr_lightning.sim.kinematics import Array, rotation_y, rotation_z
+from ugr_lightning.sim.settings import Colour
 
-Colour = tuple[float, float, float]
 DENSITY = 400.0  # kg / m^3
 _SIDES_OF_A_CIRCLE = 32
 _X_TO = {"x": np.eye(3), "y": rotation_z(np.pi / 2.0), "z": rotation_y(-np.pi / 2.0)}  # SAPIEN's cylinders lie along x

@@ -12,26 +12,16 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from ugr_lightning.contract import CAMERAS
-from ugr_lightning.errors import ConfigError
 from ugr_lightning.sim.expert import Arms, ExpertStep
 from ugr_lightning.sim.kinematics import SIDES, Array
-from ugr_lightning.sim.objects import Colour, Prop, pose_of
+from ugr_lightning.sim.objects import pose_of
 from ugr_lightning.sim.robot import ACTION_HIGH, ACTION_LOW, HOME_ACTION, UID
+from ugr_lightning.sim.room import furnish, illuminate
+from ugr_lightning.sim.settings import Point, Surroundings, check_setting, surroundings_of
 
 SIMULATION_HZ, CONTROL_HZ = 250, 25
 SETTLE_SECONDS = 0.1  # inside reset, never recorded
 TOUCH_IMPULSE = 1e-6  # N s; pairs that are only close to each other are listed by PhysX with no impulse
-
-
-class Appearance(NamedTuple):
-    """What the surroundings look like in one episode."""
-
-    table: Colour
-    wall: Colour
-    floor: Colour
-    ambient: float
-    key_light: float
-    fill_light: float
 
 
 class Touch(NamedTuple):
@@ -48,14 +38,7 @@ class Touch(NamedTuple):
     points: Array
 
 
-def _clean(rng: np.random.Generator) -> Appearance:
-    return Appearance((0.66, 0.57, 0.47), (0.78, 0.80, 0.83), (0.45, 0.45, 0.47), 0.45, 0.8, 0.3)
-
-
-SETTINGS = {"demo_clean": _clean}  # setting -> the episode's appearance
-
-
-def look_at(eye: tuple[float, float, float], target: tuple[float, float, float]) -> sapien.Pose:
+def look_at(eye: Point, target: Point) -> sapien.Pose:
     """Pose of a camera (x forward, z up) at `eye` that looks at `target`."""
     forward = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     left = np.cross([0.0, 0.0, 1.0], forward)
@@ -66,10 +49,11 @@ def look_at(eye: tuple[float, float, float], target: tuple[float, float, float])
 class TwoArmEnv(BaseEnv):
     """A tabletop with two ViperX arms.
 
+    The table top is z = 0 in every setting; where a setting lowers it, arms and high camera stand higher above it.
     Every reset builds the scene anew: solver and contact caches then carry nothing over from one episode to the next.
 
     Args:
-        setting: how the surroundings vary, a key of `SETTINGS`.
+        setting: how the surroundings vary, a key of `settings.SETTINGS`.
         image_size: (H, W) of the three cameras.
 
     Raises:
@@ -84,9 +68,9 @@ class TwoArmEnv(BaseEnv):
     def __init__(
         self, *args: Any, setting: str = "demo_clean", image_size: tuple[int, int] = (120, 160), **kwargs: Any
     ) -> None:
-        if setting not in SETTINGS:
-            raise ConfigError("setting", " or ".join(SETTINGS), repr(setting), "Choose one of these.")
+        check_setting(setting)
         self.setting, self.image_size = setting, image_size
+        self.surroundings: Surroundings = surroundings_of(setting, 0)  # of the running episode
         self.command: np.ndarray = HOME_ACTION.copy()  # (14,)
         self.succeeded = False
         self._touches: list[Touch] | None = None
@@ -140,9 +124,11 @@ class TwoArmEnv(BaseEnv):
     def _default_sensor_configs(self) -> list[CameraConfig]:
         height, width = self.image_size
         links = self.agent.robot.links_map
+        look = self.surroundings
+        high = pose_of((0.0, 0.0, look.table_drop)) * look_at(look.camera_eye, look.camera_target)
         wrist = look_at((0.01, 0.0, 0.125), (0.165, 0.0, 0.0))
         cameras = {
-            "cam_high": (look_at((0.0, -0.55, 0.66), (0.0, -0.01, 0.06)), 50.0, None),
+            "cam_high": (high, 50.0, None),
             "cam_right_wrist": (wrist, 70.0, links["right_gripper_link"]),
             "cam_left_wrist": (wrist, 70.0, links["left_gripper_link"]),
         }
@@ -161,27 +147,15 @@ class TwoArmEnv(BaseEnv):
         return super().reset(seed=seed, options={**(options or {}), "reconfigure": True})
 
     def _load_agent(self, options: dict[str, Any]) -> None:
-        super()._load_agent(options, sapien.Pose())
+        self.surroundings = surroundings_of(self.setting, int(self._episode_seed[0]))
+        super()._load_agent(options, pose_of((0.0, 0.0, self.surroundings.table_drop)))
 
     def _load_scene(self, options: dict[str, Any]) -> None:
-        seed = int(self._episode_seed[0])
-        # A stream of its own, so that a seed has the same props under every setting.
-        self._appearance = look = SETTINGS[self.setting](np.random.default_rng([seed, 1]))
-        Prop(self.scene).box((1.5, 1.1, 0.04), (0.0, 0.0, -0.02), look.table).build("table", sapien.Pose(), static=True)
-        room = Prop(self.scene)
-        for x, y in ((2.0, 0.0), (-2.0, 0.0), (0.0, 2.0), (0.0, -2.0)):  # the shader's sky is black
-            size = (0.02 if x else 4.0, 0.02 if y else 4.0, 4.0)
-            room.box(size, (x, y, 1.0), look.wall, solid=False)
-        room.box((4.0, 4.0, 0.02), (0.0, 0.0, -0.75), look.floor, solid=False)
-        room.box((4.0, 4.0, 0.02), (0.0, 0.0, 2.5), look.wall, solid=False)
-        room.build("room", sapien.Pose(), static=True)
-        self.build(np.random.default_rng(seed))
+        furnish(self.scene, self.surroundings)
+        self.build(np.random.default_rng(int(self._episode_seed[0])))
 
     def _load_lighting(self, options: dict[str, Any]) -> None:
-        look = self._appearance
-        self.scene.set_ambient_light([look.ambient] * 3)
-        self.scene.add_directional_light([0.3, 0.4, -1.0], [look.key_light] * 3)
-        self.scene.add_directional_light([-0.5, -0.3, -1.0], [look.fill_light] * 3)
+        illuminate(self.scene, self.surroundings)
 
     def _initialize_episode(self, env_idx: torch.Tensor, options: dict[str, Any]) -> None:
         self.command, self.succeeded, self._touches = HOME_ACTION.copy(), False, None

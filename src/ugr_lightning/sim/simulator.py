@@ -104,7 +104,8 @@ class Simulator:
         """Start the episode of a seed; the same one bit for bit, whatever ran before."""
         self._env.reset(seed=int(seed))
         self._seed = int(seed)
-        self._scene_info = {"seed": self._seed, **self._env.describe()}
+        surroundings = self._env.surroundings.describe()
+        self._scene_info = {"seed": self._seed, **self._env.describe(), "surroundings": surroundings}
         return self._frame()
 
     def step(self, action: np.ndarray) -> Frame:
@@ -135,12 +136,12 @@ class Simulator:
         """
         self._require_episode()
         try:
-            yield from self._env.expert(Arms(self._env.command, self.speed))
+            yield from self._env.expert(Arms(self._env.command, self.speed, self._env.surroundings.table_drop))
         except UnreachableError:
             return
 
     def scene_info(self) -> dict[str, Any]:
-        """Seed and where things were at reset, as plain containers."""
+        """Seed, where things were at reset and what surrounded them, as plain containers."""
         self._require_episode()
         return self._scene_info
 
