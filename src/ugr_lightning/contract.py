@@ -22,9 +22,12 @@ CHUNK_LENGTH = 50
 class Observation(NamedTuple):
     """What a policy sees at one control step.
 
+    A policy of several `observation_steps` T also sees the steps just before, oldest first: both tensors then have an
+    axis T after B. Before the first step of an episode the first observation is repeated.
+
     Args:
-        images: (B, V, 3, H, W) uint8 RGB, cameras in the order of the policy's `cameras`.
-        state: (B, S) float32, commanded joints in robot units.
+        images: (B, V, 3, H, W) uint8 RGB, cameras in the order of the policy's `cameras`; (B, T, V, 3, H, W).
+        state: (B, S) float32, commanded joints in robot units; (B, T, S).
     """
 
     images: Tensor
@@ -35,8 +38,8 @@ class Batch(NamedTuple):
     """Observations with the action chunks that followed them in a demonstration.
 
     Args:
-        images: (B, V, 3, H, W) uint8 RGB.
-        state: (B, S) float32, robot units.
+        images: (B, V, 3, H, W) uint8 RGB; (B, T, V, 3, H, W) for several observation steps, see `Observation`.
+        state: (B, S) float32, robot units; (B, T, S).
         actions: (B, K, A) float32, robot units; steps past the end repeat the last action.
         valid: (B, K) bool, False on steps past the end of the episode.
         episode: (B,) int64, index of the episode in the data set.
@@ -101,6 +104,7 @@ class ChunkPolicy(Blueprinted, nn.Module, ABC):
     chunk_length: int
     state_dim: int
     action_dim: int
+    observation_steps: int = 1
 
     @abstractmethod
     def set_statistics(self, statistics: Statistics) -> None:

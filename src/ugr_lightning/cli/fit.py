@@ -106,6 +106,9 @@ class UGRCLI(LightningCLI):
         parser.link_arguments("seed_everything", "data.seed", int)  # one seed names a training
         parser.link_arguments("model", "data.cameras", lambda module: list(module.policy.cameras), "instantiate")
         parser.link_arguments("model", "data.chunk_length", lambda module: module.policy.chunk_length, "instantiate")
+        parser.link_arguments(
+            "model", "data.observation_steps", lambda module: module.policy.observation_steps, "instantiate"
+        )
 
     def parse_arguments(self, parser: LightningArgumentParser, args: Any) -> None:
         """Parse; what is wrong becomes one paragraph that names the key."""

@@ -30,6 +30,7 @@ class ChunkDataset(Dataset[Batch]):
         action_offset: target k of step t is action[t + k + action_offset]; 0 is the action commanded at t + k,
             -1 repeats the previous command first, as RoboTwin's own training does. Before the first action: the first.
         after_end: steps past the end repeat the last action and are `mask`ed, or supervised as a `hold`.
+        observation_steps: T, observations per sample; before the first step of an episode the first is repeated.
 
     Source: FACTS 2.4, 2.5.
     """
@@ -42,9 +43,12 @@ class ChunkDataset(Dataset[Batch]):
         state: ProprioceptionKind = "commanded",
         action_offset: int = 0,
         after_end: AfterEnd = "mask",
+        observation_steps: int = 1,
     ) -> None:
         if chunk_length < 1:
             raise ConfigError("data.chunk_length", "at least 1", chunk_length, "Correct the number.")
+        if observation_steps < 1:
+            raise ConfigError("data.observation_steps", "at least 1", observation_steps, "Correct the number.")
         if action_offset > 0:
             raise ConfigError("data.action_offset", "0 or a negative number", action_offset, "Correct the number.")
         if after_end not in ("mask", "hold"):
@@ -53,6 +57,7 @@ class ChunkDataset(Dataset[Batch]):
         self.states = np.concatenate([episode.proprioception(state) for episode in episodes])  # (N, S)
         self.actions = np.concatenate([episode.action for episode in episodes])  # (N, A)
         self.window = np.arange(chunk_length)  # (K,)
+        self.history = np.arange(1 - observation_steps, 1)  # (T,), oldest first
         self.action_offset, self.after_end = action_offset, after_end
 
     def __len__(self) -> int:
@@ -65,7 +70,8 @@ class ChunkDataset(Dataset[Batch]):
             indices: frame numbers, B of them.
 
         Returns:
-            `images` is a (B, V, 3, H, W) view of (B, V, H, W, 3) memory: channels last without a copy.
+            `images` is a (B, V, 3, H, W) view of (B, V, H, W, 3) memory: channels last without a copy. With several
+            observation steps it and `state` have an axis T after B.
         """
         frames = np.asarray(indices, dtype=np.int64)  # (B,)
         episode, step = self.frames.locate(frames)
@@ -74,10 +80,14 @@ class ChunkDataset(Dataset[Batch]):
         inside = target < length[:, None]  # (B, K)
         rows = first[:, None] + np.minimum(target, length[:, None] - 1)  # (B, K)
         valid = inside if self.after_end == "mask" else np.ones_like(inside)
-        images = torch.from_numpy(self.store.take(frames))  # (B, V, H, W, 3)
+        seen = first[:, None] + np.maximum(step[:, None] + self.history, 0)  # (B, T)
+        images = torch.from_numpy(self.store.take(seen.ravel())).unflatten(0, seen.shape)  # (B, T, V, H, W, 3)
+        state = torch.from_numpy(self.states[seen])  # (B, T, S)
+        if len(self.history) == 1:
+            images, state = images[:, 0], state[:, 0]
         return Batch(
-            images=images.permute(0, 1, 4, 2, 3),  # (B, V, 3, H, W)
-            state=torch.from_numpy(self.states[frames]),  # (B, S)
+            images=images.movedim(-1, -3),  # (B, [T,] V, 3, H, W)
+            state=state,
             actions=torch.from_numpy(self.actions[rows]),  # (B, K, A)
             valid=torch.from_numpy(valid),
             episode=torch.from_numpy(episode),

@@ -67,6 +67,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         state: `commanded` joint targets (RoboTwin's) or `measured` joints.
         action_offset: 0, target k is the action commanded at t + k; -1 shifts by one as RoboTwin's training does.
         after_end: steps past an episode's end are `mask`ed from the losses, or supervised to `hold` the last command.
+        observation_steps: T, observations per sample, the newest and those just before it.
         sampling: how training samples are drawn.
         recording: how missing demonstrations are recorded.
 
@@ -94,6 +95,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         state: ProprioceptionKind = "commanded",
         action_offset: int = 0,
         after_end: AfterEnd = "mask",
+        observation_steps: int = 1,
         sampling: Sampling = DEFAULT_SAMPLING,
         recording: Recording = DEFAULT_RECORDING,
     ) -> None:
@@ -114,7 +116,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.chunk_length, self.batch_size, self.val_stride = chunk_length, batch_size, val_stride
         self.num_workers, self.seed, self.split_seed = num_workers, seed, split_seed
         self.state, self.action_offset, self.after_end = state, action_offset, after_end
-        self.sampling, self.recording = sampling, recording
+        self.observation_steps, self.sampling, self.recording = observation_steps, sampling, recording
         self.demonstrations: list[Episode] = []
 
     def prepare_data(self) -> None:
@@ -137,7 +139,8 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.episode_split: Split = split_episodes(len(episodes), self.split_seed)
         self.statistics: Statistics = compute_statistics(episodes, self.episode_split.train, state=self.state)
         store = open_frames(episodes, self.cache, self.image_size)
-        self.data = ChunkDataset(episodes, store, self.chunk_length, self.state, self.action_offset, self.after_end)
+        conventions = (self.state, self.action_offset, self.after_end, self.observation_steps)
+        self.data = ChunkDataset(episodes, store, self.chunk_length, *conventions)
         self.demonstrations = episodes
 
     def _chosen(self) -> dict[int, Path]:

@@ -35,7 +35,7 @@ def store_weights_as(module: nn.Module, dtype: torch.dtype, keep: Collection[nn.
         keep: layers that stay as they are.
     """
     for layer in module.modules():
-        if isinstance(layer, (nn.Conv2d, nn.Linear, Attention)) and layer not in keep:
+        if isinstance(layer, (nn.Conv1d, nn.Conv2d, nn.ConvTranspose1d, nn.Linear, Attention)) and layer not in keep:
             for parameter in layer.parameters(recurse=False):
                 parameter.data = parameter.data.to(dtype)
 

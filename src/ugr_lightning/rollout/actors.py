@@ -152,8 +152,9 @@ class PolicyActor(Actor):
         policy = self.policy
         self._execution = make_execution(execution, policy.chunk_length, policy.action_dim, slots)
         self.execution = self._execution.name
-        self._state = torch.zeros(slots, policy.state_dim)  # (B, S)
+        self._state = torch.zeros(slots, policy.observation_steps, policy.state_dim)  # (B, T, S), oldest first
         self._images: torch.Tensor | None = None
+        self._new: set[int] = set()  # slots whose episode begins
         tensors = [*policy.parameters(), *policy.buffers()]
         self._device = tensors[0].device if tensors else torch.device("cpu")
         self._was_training = policy.training
@@ -164,35 +165,48 @@ class PolicyActor(Actor):
         self.policy.train(self._was_training)
 
     def start(self, slot: int, seed: int, frame: Any) -> None:
-        """Forget the slot's chunks."""
+        """Forget the slot's chunks and observations."""
         assert self._execution is not None
         self._execution.reset(slot)
+        self._new.add(slot)
 
     def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
         """Query the policy for the slots that need it, then execute all slots' chunks."""
         assert self._execution is not None
+        for slot, frame in frames.items():
+            self._see(slot, frame)
         asking = [slot for slot in sorted(frames) if self._execution.needs_query(slot)]
         uncertainty: dict[int, np.ndarray] = {}
         if asking:
-            chunks, log_variance = self._query({slot: frames[slot] for slot in asking})
+            chunks, log_variance = self._query()
             for slot in asking:
                 self._execution.push(slot, chunks[slot])
                 if log_variance is not None:
                     uncertainty[slot] = log_variance[slot]
         return {slot: Decision(self._execution.next(slot), uncertainty.get(slot)) for slot in frames}
 
-    def _query(self, frames: Mapping[int, Any]) -> tuple[np.ndarray, np.ndarray | None]:
-        """Chunks (B, K, A) and s_k (B, K) for a batch in which only the rows of `frames` are new."""
+    def _see(self, slot: int, frame: Any) -> None:
+        """Put a frame behind the slot's earlier ones; the first of an episode takes the place of all."""
         if self._images is None:
-            height, width = next(iter(frames.values())).images.shape[1:3]
-            shape = (len(self._state), len(self._views), height, width, 3)
-            self._images = torch.zeros(shape, dtype=torch.uint8)  # (B, V, H, W, 3)
-        for slot, frame in frames.items():
-            self._images[slot] = torch.from_numpy(frame.images[self._views])  # (V, H, W, 3)
-            self._state[slot] = torch.from_numpy(np.asarray(getattr(frame, self.state), np.float32))  # (S,)
-        images = self._images.to(self._device).permute(0, 1, 4, 2, 3)  # (B, V, 3, H, W), a view: channels stay last
+            shape = (*self._state.shape[:2], len(self._views), *frame.images.shape[1:3], 3)
+            self._images = torch.zeros(shape, dtype=torch.uint8)  # (B, T, V, H, W, 3)
+        kept = slice(None) if slot in self._new else slice(-1, None)
+        self._new.discard(slot)
+        for past, now in (
+            (self._images[slot], torch.from_numpy(frame.images[self._views])),  # (T, V, H, W, 3), (V, H, W, 3)
+            (self._state[slot], torch.from_numpy(np.asarray(getattr(frame, self.state), np.float32))),  # (T, S), (S,)
+        ):
+            past[:-1] = past[1:].clone()
+            past[kept] = now
+
+    def _query(self) -> tuple[np.ndarray, np.ndarray | None]:
+        """Chunks (B, K, A) and s_k (B, K) for what all slots see."""
+        assert self._images is not None
+        images, state = self._images.to(self._device), self._state.to(self._device)
+        if self.policy.observation_steps == 1:
+            images, state = images[:, 0], state[:, 0]  # (B, V, H, W, 3), (B, S)
         with torch.no_grad():  # not inference_mode: what a policy caches here must still serve its training
-            chunk = self.policy.predict(Observation(images, self._state.to(self._device)))
+            chunk = self.policy.predict(Observation(images.movedim(-1, -3), state))  # a view: channels stay last
         log_variance = None if chunk.log_variance is None else chunk.log_variance.float().cpu().numpy()
         return chunk.actions.float().cpu().numpy(), log_variance
 

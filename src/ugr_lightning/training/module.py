@@ -27,6 +27,7 @@ class PolicyModule(LightningModule):
         weight_decay: AdamW's decoupled weight decay.
         warmup_steps: optimiser steps over which the learning rate rises linearly.
         schedule: what follows the warm-up: `constant`, or `cosine` down to a hundredth at the trainer's last step.
+        betas: decay rates of AdamW's two averages.
     """
 
     def __init__(
@@ -37,6 +38,7 @@ class PolicyModule(LightningModule):
         weight_decay: float = 1e-4,
         warmup_steps: int = 0,
         schedule: Literal["constant", "cosine"] = "constant",
+        betas: tuple[float, float] = (0.9, 0.999),
     ) -> None:
         super().__init__()
         self.policy = policy
@@ -45,6 +47,7 @@ class PolicyModule(LightningModule):
         self.weight_decay = weight_decay
         self.warmup_steps = warmup_steps
         self.schedule = schedule
+        self.betas = tuple(betas)
         self.scores = nn.ModuleDict(_scores())
         self.last_chunk: Chunk | None = None  # of the validation batch at hand; the figures read it
 
@@ -123,7 +126,9 @@ class PolicyModule(LightningModule):
             {"params": [p for name, p in named if "backbone" in name], "lr": self.backbone_learning_rate},
         ]
         groups = [group for group in groups if group["params"]]
-        optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, weight_decay=self.weight_decay, fused=True)
+        optimizer = torch.optim.AdamW(
+            groups, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay, fused=True
+        )
         total = int(self.trainer.estimated_stepping_batches) if self.schedule == "cosine" else 0
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step, total))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

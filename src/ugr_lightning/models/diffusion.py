@@ -1,0 +1,296 @@
+"""Diffusion Policy: chunks made from noise by a U-Net that is conditioned on the observations."""
+
+import copy
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any, Literal
+
+import torch
+from torch import Tensor, nn
+
+from ugr_lightning.contract import ACTION_DIM, STATE_DIM, Batch, Chunk, ChunkPolicy, Observation, Statistics
+from ugr_lightning.errors import ConfigError, NumericsError
+from ugr_lightning.models.act import spatial_softmax
+from ugr_lightning.models.augmentation import shift_images
+from ugr_lightning.models.inference import fold_normalisation, store_weights_as
+from ugr_lightning.models.noise_process import NoiseProcess, PredictionName, SamplerName
+from ugr_lightning.models.normalizer import Normalizer
+from ugr_lightning.models.precision import Precision, autocast
+from ugr_lightning.models.unet import ConditionalUNet
+from ugr_lightning.models.vision import NormName, ResNet18, StemName
+
+
+class DiffusionPolicy(ChunkPolicy):
+    """Predicts a chunk of actions by removing noise step by step.
+
+    The defaults are RoboTwin's: 3 observations of the head camera, 8 predicted steps of which the first two lie in the
+    past and the other six are the chunk. `configs/` holds a smaller one that sees all cameras.
+
+    Args:
+        cameras: names of the cameras, in the order of the images.
+        chunk_length: K, steps predicted from now on.
+        observation_steps: T, observations that the policy sees, the newest and those just before it.
+        predict_past: predict also the T - 1 commands that led here, as RoboTwin does; they are not executed. Their
+            targets are the states of the history, a state being the command of the step before.
+        state_dim: S, numbers in the state.
+        action_dim: A, numbers in an action.
+        diffusion_steps: steps from a clean chunk to noise in training.
+        sampler: `ddpm` or `ddim`; the latter needs few steps.
+        sampling_steps: steps from noise to a chunk at run time.
+        prediction: what the U-Net predicts: the noise (`epsilon`), the clean `sample`, or a mix, `v_prediction`.
+        noise_draws: noisy versions of each chunk in a batch; more cost little, as the images are looked at once.
+        noise_seed: seed of the noise that every prediction starts from.
+        unet_widths: channels of each level of the U-Net; every level but the last halves the number of steps.
+        unet_kernel: steps that a convolution sees.
+        unet_groups: groups of its normalisation.
+        step_dim: numbers that encode the diffusion step.
+        share_backbone: one ResNet-18 for all cameras; otherwise one for each.
+        backbone_width: channels of the first stage of the ResNet-18; 64 is the usual one.
+        backbone_stride: total stride, 32 or 16.
+        backbone_stem: `standard`, or `unshuffle`, which is cheaper and has no published weights.
+        backbone_norm: `group`, `batch`, or `frozen` (needs `backbone_weights`).
+        backbone_weights: file with ResNet-18 weights to start from: torchvision, original ACT or lerobot key names.
+        keypoints: number of spatial-softmax keypoints a camera, beside the mean of its features; 0 for none.
+        state_dropout: probability, per sample, of hiding the state in training; 1 hides it at run time as well.
+        image_shift: largest random displacement of the images in training, in pixels.
+        precision: arithmetic of the networks: `auto` takes bf16 where the hardware has it, else fp32.
+
+    Source: FACTS 8.
+    """
+
+    def __init__(
+        self,
+        cameras: Sequence[str] = ("cam_high",),
+        chunk_length: int = 6,
+        observation_steps: int = 3,
+        predict_past: bool = True,
+        state_dim: int = STATE_DIM,
+        action_dim: int = ACTION_DIM,
+        diffusion_steps: int = 100,
+        sampler: SamplerName = "ddpm",
+        sampling_steps: int = 100,
+        prediction: PredictionName = "epsilon",
+        noise_draws: int = 1,
+        noise_seed: int = 0,
+        unet_widths: Sequence[int] = (256, 512, 1024),
+        unet_kernel: int = 5,
+        unet_groups: int = 8,
+        step_dim: int = 128,
+        share_backbone: bool = False,
+        backbone_width: int = 64,
+        backbone_stride: Literal[16, 32] = 32,
+        backbone_stem: StemName = "standard",
+        backbone_norm: NormName = "group",
+        backbone_weights: str | None = None,
+        keypoints: int = 0,
+        state_dropout: float = 0.0,
+        image_shift: int = 0,
+        precision: Precision = "auto",
+    ) -> None:
+        super().__init__()
+        for name, value in (("observation_steps", observation_steps), ("noise_draws", noise_draws)):
+            if value < 1:
+                raise ConfigError(name, "at least 1", value, "Correct the number.")
+        if predict_past and observation_steps > 1 and state_dim != action_dim:
+            fix = "Set `predict_past: false`."
+            raise ConfigError("predict_past", "states that are commands", f"{state_dim} against {action_dim}", fix)
+        self.cameras, self.chunk_length, self.observation_steps = tuple(cameras), chunk_length, observation_steps
+        self.state_dim, self.action_dim = state_dim, action_dim
+        self.past = observation_steps - 1 if predict_past else 0
+        self.noise_draws, self.noise_seed = noise_draws, noise_seed
+        self.state_dropout, self.image_shift, self.precision = state_dropout, image_shift, precision
+
+        self.normalizer = Normalizer(state_dim, action_dim, "min_max")
+        count = 1 if share_backbone else len(self.cameras)
+        self.backbones = nn.ModuleList(
+            ResNet18(backbone_width, backbone_stride, backbone_stem, backbone_norm) for _ in range(count)
+        )
+        channels, middle = 8 * backbone_width, 4 * backbone_width
+        self.keypoint_maps = nn.ModuleList(nn.Conv2d(middle, keypoints, 1) for _ in range(count if keypoints else 0))
+        seen = len(self.cameras) * (channels + 2 * keypoints) + state_dim
+        self.unet = ConditionalUNet(
+            action_dim, observation_steps * seen, unet_widths, unet_kernel, unet_groups, step_dim
+        )
+        self.process = NoiseProcess(diffusion_steps, sampler, sampling_steps, prediction)
+        if backbone_weights is not None:
+            for backbone in self._backbones():
+                backbone.load_weights(backbone_weights)
+
+    def blueprint(self) -> dict[str, Any]:
+        """The class and its arguments, without `backbone_weights`: a checkpoint holds the trained ones instead."""
+        recorded = super().blueprint()
+        return {**recorded, "init_args": {**recorded["init_args"], "backbone_weights": None}}
+
+    def set_statistics(self, statistics: Statistics) -> None:
+        """Store the normalisation statistics in the policy's buffers."""
+        self.normalizer.fit(statistics)
+
+    def losses(self, batch: Batch) -> dict[str, Tensor]:
+        """The squared error of the U-Net's prediction at random diffusion steps.
+
+        In evaluation noise and diffusion step are a function of episode and time step, so that validation has no
+        randomness and does not depend on the size of the batches.
+
+        Args:
+            batch: observations and the chunks that followed.
+
+        Returns:
+            The scalar `loss`, a mean over valid steps and dimensions.
+
+        Raises:
+            ConfigError: images of another number of cameras or observations.
+            CheckpointError: no normalisation statistics.
+        """
+        target = self.normalizer.action(batch.actions)  # (B, K, A)
+        valid = batch.valid.float()  # (B, K)
+        if self.past:
+            target = torch.cat([self.normalizer.action(batch.state[:, 1:]), target], dim=1)  # (B, L, A)
+            valid = torch.cat([valid.new_ones(valid.shape[0], self.past), valid], dim=1)  # (B, L)
+        noise, step = self._draw(batch, target.shape[1])  # (B n, L, A), (B n,), n noise draws
+        clean, valid, condition = (
+            x.repeat_interleave(self.noise_draws, dim=0) for x in (target, valid, self._condition(batch.observation))
+        )
+        noisy, wanted = self.process.corrupt(clean, noise, step)  # (B n, L, A) each
+        error = (self._denoise(noisy, step, condition) - wanted).square().mean(-1)  # (B n, L)
+        return {"loss": (error * valid).sum() / valid.sum()}
+
+    def predict(self, observation: Observation) -> Chunk:
+        """The chunk to execute, in evaluation mode whatever mode the policy is in.
+
+        All queries start from the same noise, that of `noise_seed`. A chunk therefore is a function of its observation
+        alone, whatever was asked before or beside it; and where several ways are open, successive chunks of an episode
+        tend to choose the same one, which is what averages of overlapping chunks need.
+
+        Args:
+            observation: what the robot sees now, and saw before.
+
+        Returns:
+            The chunk, in robot units.
+
+        Raises:
+            NumericsError: a NaN or an infinity in the state or in the prediction.
+            ConfigError: images of another number of cameras or observations.
+            CheckpointError: no normalisation statistics.
+        """
+        return self.sample(observation, self.noise_seed)
+
+    @torch.no_grad()
+    def sample(self, observation: Observation, seed: int) -> Chunk:
+        """One of the chunks that the policy holds possible; see `predict`.
+
+        Args:
+            observation: what the robot sees now, and saw before.
+            seed: which one; the same for all rows.
+        """
+        if not observation.state.isfinite().all():
+            fix = "Look at the robot's or the simulator's joint readings."
+            raise NumericsError("observation.state", "finite numbers", "a NaN or an infinity", fix)
+        with self._evaluation_mode():
+            condition = self._condition(observation)  # (B, C)
+            shape = (condition.shape[0], self.past + self.chunk_length, self.action_dim)
+            plan = self.process.sample(
+                lambda noisy, step: self._denoise(noisy, step, condition), shape, seed, condition.device
+            )  # (B, L, A)
+        actions = self.normalizer.robot_action(plan[:, self.past :])  # (B, K, A)
+        if not actions.isfinite().all():
+            fix = "Training diverged or the file is damaged: use an earlier checkpoint, a lower learning rate."
+            raise NumericsError("predicted actions", "finite numbers", "a NaN or an infinity", fix)
+        return Chunk(actions)
+
+    @torch.no_grad()
+    def for_inference(self) -> "DiffusionPolicy":
+        """A copy that answers the same queries faster and cannot learn.
+
+        Normalisation layers with fixed statistics are folded into their convolutions, and weights are stored in the
+        arithmetic of the networks. Later changes to this policy do not reach the copy.
+
+        Returns:
+            A policy in evaluation mode; its state dict is not that of a checkpoint.
+        """
+        fast = copy.deepcopy(self).eval().requires_grad_(False)
+        for backbone in fast._backbones():
+            fold_normalisation(backbone)
+        device = self.unet.head.weight.device
+        with autocast(self.precision, device):
+            if torch.is_autocast_enabled(device.type):
+                store_weights_as(fast, torch.bfloat16, keep=(fast.unet.head,))
+        return fast
+
+    def _denoise(self, noisy: Tensor, step: Tensor, condition: Tensor) -> Tensor:
+        with autocast(self.precision, noisy.device):
+            predicted: Tensor = self.unet(noisy, step, condition)  # (B, L, A)
+        return predicted
+
+    def _draw(self, batch: Batch, length: int) -> tuple[Tensor, Tensor]:
+        """Noise (B n, L, A) and diffusion steps (B n,) for the n noisy versions of each chunk."""
+        shape = (self.noise_draws, length, self.action_dim)
+        size, device = batch.state.shape[0], batch.state.device
+        if self.training:
+            noise = torch.randn(size * shape[0], *shape[1:], device=device)
+            return noise, torch.randint(self.process.steps, (size * shape[0],), device=device)
+        generators = [
+            torch.Generator().manual_seed(1_000_003 * episode + step)
+            for episode, step in zip(batch.episode.tolist(), batch.step.tolist(), strict=True)
+        ]
+        noise = torch.cat([torch.randn(shape, generator=generator) for generator in generators])
+        steps = [torch.randint(self.process.steps, shape[:1], generator=generator) for generator in generators]
+        return noise.to(device), torch.cat(steps).to(device)
+
+    def _condition(self, observation: Observation) -> Tensor:
+        """What the U-Net is told of the observations, (B, C) float32."""
+        images, state = observation
+        if self.observation_steps == 1:
+            images, state = images[:, None], state[:, None]
+        expected = (self.observation_steps, len(self.cameras), 3)
+        if images.dim() != 6 or images.shape[1:4] != expected or images.dtype != torch.uint8:
+            time = f"{self.observation_steps}, " if self.observation_steps > 1 else ""
+            wanted = f"(B, {time}{len(self.cameras)}, 3, H, W) uint8 for cameras {', '.join(self.cameras)}"
+            got = f"{tuple(observation.images.shape)} {images.dtype}"
+            fix = "Give the policy the cameras and the number of observations it was built for."
+            raise ConfigError("observation.images", wanted, got, fix)
+        features = self._see(images).float()  # (B, T F)
+        state = self._disturb_state(self.normalizer.state(state))  # (B, T, S)
+        return torch.cat([features, state.flatten(1)], dim=1)  # (B, C)
+
+    def _see(self, images: Tensor) -> Tensor:
+        """Features of all observations and cameras, (B, T, V, 3, H, W) uint8 to (B, T F)."""
+        size, cameras = images.shape[0], len(self.cameras)
+        frames = images.flatten(0, 1)  # (B T, V, 3, H, W)
+        if len(self.backbones) == 1:
+            seen = self._features(0, frames.flatten(0, 1)).unflatten(0, (-1, cameras))  # (B T, V, F)
+        else:
+            seen = torch.stack([self._features(camera, frames[:, camera]) for camera in range(cameras)], dim=1)
+        return seen.reshape(size, -1)
+
+    def _features(self, which: int, images: Tensor) -> Tensor:
+        """What one backbone makes of some images, (n, 3, H, W) uint8 to (n, F): mean features and keypoints."""
+        backbone = self._backbones()[which]
+        pixels = images.contiguous(memory_format=torch.channels_last)
+        if self.training and self.image_shift:
+            pixels = shift_images(pixels, self.image_shift)
+        with autocast(self.precision, images.device):
+            middle, last = backbone(backbone.prepare(pixels))  # (n, C / 2, h', w'), (n, C, h, w)
+            mean = last.float().mean((2, 3))  # (n, C)
+            if not self.keypoint_maps:
+                return mean
+            return torch.cat([mean, spatial_softmax(self.keypoint_maps[which](middle))], dim=1)
+
+    def _backbones(self) -> list[ResNet18]:
+        return [backbone for backbone in self.backbones if isinstance(backbone, ResNet18)]
+
+    def _disturb_state(self, state: Tensor) -> Tensor:
+        """Hide states, (B, T, S) normalised, of whole samples; a hidden state is the middle of the range."""
+        if self.state_dropout >= 1:
+            return torch.zeros_like(state)
+        if self.training and self.state_dropout:
+            state = state * (torch.rand(state.shape[0], 1, 1, device=state.device) >= self.state_dropout)
+        return state
+
+    @contextmanager
+    def _evaluation_mode(self) -> Iterator[None]:
+        was_training = self.training
+        self.eval()
+        try:
+            yield
+        finally:
+            self.train(was_training)
