@@ -20,14 +20,14 @@ OPEN = 0.8
 # mug turned by +-1.57, where the hand on its way to the middle would have to turn the handle by a quarter.
 MUG_X, MUG_Y = (-0.25, -0.1), (-0.05, 0.05)
 MUG_YAW = (-0.8, 0.8)  # of the handle, from pointing at the left arm
-RACK_X, RACK_Y, RACK_YAW = (0.05, 0.2), (0.13, 0.17), (-0.2, 0.2)
-MUG_RADIUS, MUG_HEIGHT = (0.025, 0.028), (0.078, 0.09)
+RACK_X, RACK_Y, RACK_YAW = (0.0, 0.1), (0.15, 0.19), (-0.2, 0.2)
+MUG_RADIUS, MUG_HEIGHT = (0.024, 0.027), (0.078, 0.09)
 HANDLE_REACH = (0.036, 0.042)  # from the wall to the outside of the handle
 MUG_COLOURS: tuple[Colour, ...] = ((0.10, 0.28, 0.75), (0.80, 0.10, 0.10), (0.05, 0.50, 0.28), (0.45, 0.15, 0.60))
 
 WALL, FLOOR, TUBE = 0.0044, 0.006, 0.0045  # thickness of the mug, radius of its handle
 SIDES_OF_MUG = 12  # flat walls; two of them face the fingers
-PEG_RADIUS, PEG_LENGTH, PEG_TILT, PEG_HEIGHT = 0.004, 0.15, 0.25, 0.27
+PEG_RADIUS, PEG_LENGTH, PEG_TILT, PEG_HEIGHT = 0.004, 0.14, 0.25, 0.27
 
 MEETING_POINT = np.array([0.0, -0.12, 0.0])
 GRASP = 0.6  # fraction of the mug's height
@@ -122,7 +122,7 @@ class HangingMug(TwoArmEnv):
     def _set_down(self, arms: Arms) -> Iterator[ExpertStep]:
         grasp = self._grasp("left")
         yield from arms.move({"left": _raised(grasp, 0.11)}, steps=34, phase="reach", overlap=10)
-        yield from arms.move({"left": grasp}, steps=26, phase="descend-left", slack=(1.0, 0.3, 0.0, 0.0))
+        yield from arms.move({"left": grasp}, steps=24, phase="descend-left", slack=(1.0, 0.3, 0.0, 0.0))
         yield from arms.grip({"left": 0.0}, steps=10, phase="grasp-left")
         yield from arms.move(
             {"left": _raised(grasp, 0.08)}, steps=18, phase="lift-left", slack=(0.0, 0.0, 1.0), overlap=8
@@ -130,35 +130,35 @@ class HangingMug(TwoArmEnv):
         waiting = TcpPose(np.array([0.2, -0.1, 0.25]), gripper_down(facing("right")))
         above = self._carrying("left", MEETING_POINT + 0.06 * UP, rotation_z(np.pi))
         yield from arms.move(
-            {"left": above, "right": waiting}, steps=40, phase="carry-left", slack=(1.0, 1.0, 0.4), overlap=8
+            {"left": above, "right": waiting}, steps=38, phase="carry-left", slack=(1.0, 1.0, 0.4), overlap=8
         )
         down = self._carrying("left", MEETING_POINT + 0.001 * UP, rotation_z(np.pi))
-        yield from arms.move({"left": down}, steps=26, phase="lower", slack=(0.4, 0.2, 0.0))
+        yield from arms.move({"left": down}, steps=24, phase="lower", slack=(0.4, 0.2, 0.0))
         yield from arms.grip({"left": 1.0}, steps=10, phase="release-left")
 
     def _take(self, arms: Arms) -> Iterator[ExpertStep]:
         up = _raised(arms.pose("left"), 0.13)
-        yield from arms.move({"left": up}, steps=18, phase="retreat-left", slack=(0.0, 0.3, 1.0), overlap=6)
+        yield from arms.move({"left": up}, steps=18, phase="retreat-left", slack=(0.0, 0.0, 0.1, 0.8), overlap=6)
         grasp = self._grasp("right")
         goals: dict[str, TcpPose | Array] = {"left": HOME, "right": _raised(grasp, 0.11)}
-        yield from arms.move(goals, steps=38, phase="exchange", slack=(1.0,), overlap=10)
-        yield from arms.move({"right": grasp}, steps=28, phase="descend-right", slack=(1.0, 0.3, 0.0, 0.0))
+        yield from arms.move(goals, steps=36, phase="exchange", slack=(1.0,), overlap=10)
+        yield from arms.move({"right": grasp}, steps=26, phase="descend-right", slack=(1.0, 0.3, 0.0, 0.0))
         yield from arms.grip({"right": 0.0}, steps=10, phase="grasp-right")
         lifted = _raised(grasp, 0.12)
         yield from arms.move({"right": lifted}, steps=22, phase="lift-right", slack=(0.0, 0.0, 1.0), overlap=8)
 
     def _hang(self, arms: Arms) -> Iterator[ExpertStep]:
         before = self._hanging(PEG_LENGTH + BEYOND)
-        yield from arms.move({"right": before}, steps=50, phase="tip", slack=(1.0, 1.0, 0.5))
+        yield from arms.move({"right": before}, steps=46, phase="tip", slack=(1.0, 1.0, 0.4), overlap=6)
         yield from arms.move(
-            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=40, phase="insert", slack=(0.5, 0.1, 0.1)
+            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.4, 0.1, 0.1)
         )
         drop = (self.reach - 2 * TUBE) / 2.0 - PEG_RADIUS + REST
-        yield from arms.move({"right": self._hanging(PEG_LENGTH / 2.0, drop)}, steps=14, phase="rest", slack=(0.1, 0.0))
+        yield from arms.move({"right": self._hanging(PEG_LENGTH / 2.0, drop)}, steps=12, phase="rest", slack=(0.1, 0.0))
         yield from arms.grip({"right": 1.0}, steps=10, phase="release-right")
         last = arms.pose("right")
         back = TcpPose(last.position - 0.1 * last.rotation[:, 0], last.rotation)
-        yield from arms.move({"right": back}, steps=20, phase="retreat-right", slack=(0.0, 0.3, 1.0))
+        yield from arms.move({"right": back}, steps=16, phase="retreat-right", slack=(0.0, 0.3, 1.0))
 
     def _grasp(self, side: str) -> TcpPose:
         """Straight down over the mug as it stands, fingers left and right of the handle, which points to the arm."""
