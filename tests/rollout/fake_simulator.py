@@ -38,6 +38,7 @@ class FakeSimulator:
 
     control_hz = 25.0
     horizon = 20
+    task_version = 1
 
     def __init__(self, task, *, setting="demo_clean", image_size=(120, 160), render=True):
         self.task, self.setting, self.image_size, self.render = task, setting, image_size, render

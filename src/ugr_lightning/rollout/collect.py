@@ -25,6 +25,8 @@ from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.progress import Progress
 from ugr_lightning.rollout.recorder import Outcome, Recorder, publish_text, staged_episode, staged_scene, staged_video
 from ugr_lightning.rollout.workers import Worker, WorkerLostError, open_simulator, start_all, wait_for_any
+from ugr_lightning.sim.settings import check_setting
+from ugr_lightning.sim.tasks import check_task, task_names, task_summaries, task_version
 
 EPISODE_TIMEOUT_S = 600.0
 """No expert takes that long; a simulator that does has hung."""
@@ -67,6 +69,7 @@ def collect(
         simulator: what to open in place of `sim.Simulator`; called with the same arguments.
 
     Raises:
+        ConfigError: no such task or setting.
         DataError: the folder holds a recording of another kind; says what differs. Nothing is deleted.
         SimulationError: the simulator does not start, or the expert solves nothing.
 
@@ -76,6 +79,9 @@ def collect(
         got = f"{episodes} episodes, {workers} workers"
         raise ConfigError("collect", "at least one episode and one worker", got, "Correct the number.")
     folder, noise = Path(folder), noise if noise is not None else Noise()
+    if simulator is None and not find_episodes(folder):
+        check_task(task)
+        check_setting(setting)
     folder.mkdir(parents=True, exist_ok=True)
     settings = _settings(task, setting, image_size, noise, first_seed)
     with (folder / "recording.lock").open("w") as lock:
@@ -140,8 +146,6 @@ class _Ledger:
     """
 
     def __init__(self, folder: Path, task: str, first_seed: int) -> None:
-        from ugr_lightning.sim.tasks import task_summaries
-
         self._folder = folder
         self._seeds = read_seeds(folder)
         self._scenes = read_scene_info(folder)
@@ -219,6 +223,7 @@ def _settings(task: str, setting: str, image_size: tuple[int, int], noise: Noise
         "image_size": list(image_size),
         "noise": asdict(noise),
         "first_seed": first_seed,
+        "task_version": task_version(task) if task in task_names() else None,
     }
 
 
@@ -227,9 +232,9 @@ def _is_complete(folder: Path, episodes: int, settings: dict[str, Any]) -> bool:
     path, present = folder / "recording.json", set(find_episodes(folder))
     if path.is_file():
         try:
-            found = json.loads(path.read_text())
+            found = {"task_version": settings["task_version"], **json.loads(path.read_text())}  # older ones lack it
             differences = [f"{key} {found.get(key)!r}" for key in settings if found.get(key) != settings[key]]
-        except (ValueError, AttributeError) as error:
+        except (ValueError, TypeError) as error:
             raise DataError(path, "the settings of a recording", error, "Restore the file.") from error
         if differences:
             wanted = ", ".join(f"{key} {settings[key]!r}" for key in settings if found.get(key) != settings[key])

@@ -174,6 +174,7 @@ class Recorder:
                 seed=seed,
                 control_hz=simulator.control_hz,
                 noise={**asdict(self._noise), "attempt": attempt},
+                task_version=simulator.task_version,
             )
         except OSError as error:
             fix = "Make room or correct the permissions and run the same command again: it goes on where it stopped."

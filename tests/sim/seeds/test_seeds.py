@@ -5,7 +5,7 @@ import pytest
 
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim import seeds
-from ugr_lightning.sim.tasks import load_task, task_names
+from ugr_lightning.sim.tasks import load_task, task_names, task_version
 
 
 @pytest.mark.parametrize("task", task_names())
@@ -44,10 +44,30 @@ def test_unknown_tasks_and_missing_lists_are_clear_errors(monkeypatch, tmp_path)
         seeds.evaluation_seeds("click_alarmclock")
 
 
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        ({"version": 99}, "got a seed list of click_alarmclock, version 99"),
+        ({"task": "handover_block"}, "got a seed list of handover_block"),
+        ({"seeds": [100001, 100000]}, "rising order"),
+        ({"seeds": [7]}, "from 100000"),
+        ({"seeds": None}, "TypeError"),
+    ],
+)
+def test_a_list_of_another_version_or_with_other_seeds_is_refused(change, complaint, monkeypatch, tmp_path):
+    content = json.loads(seeds._path("click_alarmclock").read_text())
+    (tmp_path / "list.json").write_text(json.dumps(content | change))
+    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "list.json")
+    with pytest.raises(SimulationError, match=complaint) as raised:
+        seeds.evaluation_seeds("click_alarmclock")
+    assert "--task click_alarmclock" in str(raised.value)
+
+
 def test_a_list_is_computed_from_what_the_expert_solves(monkeypatch, tmp_path):
     monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "list.json")
     monkeypatch.setattr(seeds, "COUNT", 2)
-    monkeypatch.setattr(seeds, "compute_evaluation_seeds", lambda task: {"task": task, "version": 1, "seeds": [100000]})
+    found = {"task": "click_alarmclock", "version": task_version("click_alarmclock"), "seeds": [100000]}
+    monkeypatch.setattr(seeds, "compute_evaluation_seeds", lambda task: found)
     assert seeds.write_evaluation_seeds("click_alarmclock") == tmp_path / "list.json"
     assert seeds.evaluation_seeds("click_alarmclock") == [100000]
     assert [path.name for path in tmp_path.iterdir()] == ["list.json"]

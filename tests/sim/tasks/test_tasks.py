@@ -5,7 +5,7 @@ import pytest
 
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.sim.simulator import Simulator
-from ugr_lightning.sim.tasks import environment_id, load_task, task_names, task_summaries
+from ugr_lightning.sim.tasks import environment_id, load_task, task_names, task_summaries, task_version
 
 
 def test_tasks_are_found_without_importing_the_simulator():
@@ -28,7 +28,7 @@ def test_every_task_has_a_summary_a_horizon_and_a_version():
         assert summaries[name].endswith(".")
         task = load_task(name)
         assert task.horizon > 0
-        assert task.version >= 1
+        assert task_version(name) == task.version >= 1
         assert environment_id(name).startswith("UGR-")
 
 

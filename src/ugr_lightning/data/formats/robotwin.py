@@ -53,6 +53,7 @@ def write_episode(
     seed: int,
     control_hz: float,
     noise: Mapping[str, Any] | None = None,
+    task_version: int | None = None,
 ) -> None:
     """Write one episode of N decision steps, hence N + 1 frames, so that it is either complete on disk or absent.
 
@@ -77,6 +78,7 @@ def write_episode(
         seed: simulator seed.
         control_hz: decision steps per second.
         noise: how noise was injected, plain values; None for none.
+        task_version: version of the task; None where it has none.
 
     Raises:
         DataError: an array of another shape, or NaN or infinity in one; nothing is written.
@@ -102,6 +104,8 @@ def write_episode(
     def fill(file: h5py.File) -> None:
         file.attrs["ugr_format_version"] = FORMAT_VERSION
         file.attrs["seed"], file.attrs["control_hz"] = int(seed), float(control_hz)
+        if task_version is not None:
+            file.attrs["task_version"] = int(task_version)
         texts = {"task": task, "setting": setting, "noise": json.dumps(dict(noise or {}), sort_keys=True)}
         for name, text in {**texts, "package_version": version("ugr-lightning")}.items():
             file.attrs[name] = np.bytes_(text.encode())  # fixed width: see `read_attribute`
@@ -264,6 +268,7 @@ def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
         got = f"version {written}"
         raise DataError(file.filename, f"format version {FORMAT_VERSION}", got, "Update ugr-lightning.")
     kinds: dict[str, type] = {"seed": int, "control_hz": float, "task": str, "setting": str, "noise": str}
+    kinds["task_version"] = int
     for name, kind in kinds.items():
         value = read_attribute(file, name)
         if value is None:

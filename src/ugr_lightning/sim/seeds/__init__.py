@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ugr_lightning.errors import SimulationError
-from ugr_lightning.sim.tasks import check_task
+from ugr_lightning.sim.tasks import task_version
 
 DEMONSTRATION_START = 0
 EVALUATION_START = 100_000
@@ -24,16 +24,22 @@ def evaluation_seeds(task: str) -> list[int]:
 
     Raises:
         ConfigError: there is no such task.
-        SimulationError: the list is missing or damaged.
+        SimulationError: the list is missing, damaged, or of another task or version of the task.
     """
-    check_task(task)
-    path = _path(task)
+    version, path = task_version(task), _path(task)
+    fix = f"Recompute it: `python -m ugr_lightning.sim.seeds --task {task}`."
     try:
-        seeds = json.loads(path.read_text(encoding="utf-8"))["seeds"]
-    except (OSError, ValueError, KeyError) as error:
-        fix = f"Recompute it: `python -m ugr_lightning.sim.seeds --task {task}`."
+        content = json.loads(path.read_text(encoding="utf-8"))
+        owner, seeds = (content["task"], content["version"]), [int(seed) for seed in content["seeds"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise SimulationError(path, "a list of evaluation seeds", type(error).__name__, fix) from error
-    return [int(seed) for seed in seeds]
+    if owner != (task, version):
+        got = f"a seed list of {owner[0]}, version {owner[1]}"
+        raise SimulationError(path, f"a seed list of {task}, version {version}", got, fix)
+    if seeds != sorted(set(seeds)) or not seeds or not EVALUATION_START <= seeds[0] <= seeds[-1] < SELECTION_START:
+        expected = f"different seeds in rising order from {EVALUATION_START} to {SELECTION_START - 1}"
+        raise SimulationError(path, expected, f"{seeds[:3]} ...", fix)
+    return seeds
 
 
 def seeds_hash(seeds: Sequence[int]) -> str:

@@ -24,6 +24,21 @@ def task_summaries() -> dict[str, str]:
     return summaries
 
 
+def task_version(name: str) -> int:
+    """Version of a task, read from its file without loading it; raised whenever the same seed means something else.
+
+    Raises:
+        ConfigError: there is no such task.
+        SimulationError: its class states none.
+    """
+    check_task(name)
+    path = Path(__file__).parent / f"{name}.py"
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["version"]:
+            return int(ast.literal_eval(node.value))
+    raise SimulationError(path, "a line `version = 1` in the class", "none", "State the task's version.")
+
+
 def check_task(name: str) -> None:
     """Make sure that a task exists, without loading it.
 
