@@ -47,6 +47,16 @@ def recording(tmp_path_factory):
     return root
 
 
+@pytest.fixture
+def ten_demonstrations(tmp_path):
+    """Root of a recording of ten made-up demonstrations: two of them validate."""
+    folder = tmp_path / "ten" / "click_alarmclock" / "demo_clean"
+    for index in range(10):
+        write_demonstration(folder, index)
+    write_seeds(folder, range(10))
+    return tmp_path / "ten"
+
+
 TINY = """
 trainer:
   max_steps: 6

@@ -16,6 +16,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
     "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
     "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
+    "analyze": ("ugr_lightning.cli.analyze:run", "whether a checkpoint's uncertainty knows the error"),
+    "benchmark": ("ugr_lightning.cli.benchmark:run", "policies, tasks and training seeds of one yaml: record, train, evaluate"),
+    "report": ("ugr_lightning.cli.report:run", "compare policies: intervals, paired tests, what may be concluded"),
     "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
     "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }

@@ -1,0 +1,121 @@
+"""What a trained policy predicts on the demonstrations it was, and was not, trained on."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ugr_lightning.contract import Chunk, ChunkPolicy, Observation
+from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.errors import DataError
+
+STD_FLOOR = 1e-2  # as in the policies' normalisation
+
+
+class Predictions(NamedTuple):
+    """Errors and uncertainties of n chunks, in standard deviations of the training actions; NaN on padded steps.
+
+    Args:
+        coarse: (n, K) length of the error of the coarse action, the one that the uncertainty head learns.
+        executed: (n, K) the same of the executed action.
+        log_variance: (n, K) s_k; None where the policy has none.
+        refined: (n, K) bool; None where the policy does not refine.
+        episode: (n,) position of the episode in the data.
+        step: (n,) time step of the observation.
+    """
+
+    coarse: np.ndarray
+    executed: np.ndarray
+    log_variance: np.ndarray | None
+    refined: np.ndarray | None
+    episode: np.ndarray
+    step: np.ndarray
+
+    def rows(self, index: np.ndarray) -> "Predictions":
+        """Some of the chunks."""
+        return Predictions(*(None if values is None else values[index] for values in self))
+
+
+def predict(
+    policy: ChunkPolicy,
+    data: ChunkDataModule,
+    episodes: tuple[int, ...],
+    *,
+    stride: int = 5,
+    batch_size: int = 16,
+    with_chunk: Callable[[Observation, Chunk], None] | None = None,
+) -> Predictions:
+    """Query a policy on every `stride`-th step of some episodes.
+
+    Args:
+        policy: in evaluation mode.
+        data: after `setup`.
+        episodes: positions of the episodes.
+        stride: control steps between two queries.
+        batch_size: queries at once.
+        with_chunk: called with each batch's observation and chunk.
+
+    Returns:
+        Predictions in the order of episode and step.
+    """
+    frames = data.data.frames.of(episodes, stride)
+    std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
+    parts: list[dict[str, Any]] = []
+    for start in range(0, len(frames), batch_size):
+        batch = data.data.__getitems__(frames[start : start + batch_size].tolist())
+        with torch.no_grad():
+            chunk = policy.predict(batch.observation)
+
+        def error(actions: torch.Tensor, batch: Any = batch) -> np.ndarray:
+            length = ((actions.float() - batch.actions) / std).norm(dim=-1)  # (B, K)
+            return length.masked_fill(~batch.valid, torch.nan).double().numpy()
+
+        parts.append(
+            {
+                "coarse": error(chunk.actions if chunk.coarse is None else chunk.coarse),
+                "executed": error(chunk.actions),
+                "log_variance": None if chunk.log_variance is None else chunk.log_variance.double().numpy(),
+                "refined": None if chunk.refined is None else chunk.refined.numpy(),
+                "episode": batch.episode.numpy(),
+                "step": batch.step.numpy(),
+            }
+        )
+        if with_chunk is not None:
+            with_chunk(batch.observation, chunk)
+    columns = {name: [part[name] for part in parts] for name in Predictions._fields}
+    return Predictions(**{name: None if found[0] is None else np.concatenate(found) for name, found in columns.items()})
+
+
+def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end: str | None = None) -> ChunkDataModule:
+    """The demonstrations a checkpoint was trained on, with its own split.
+
+    Args:
+        policy: from the checkpoint.
+        trained: what the checkpoint says about its data.
+        root: folder of recordings.
+        after_end: `mask` or `hold` in place of the checkpoint's own.
+
+    Raises:
+        DataError: the recording is not there, or its episodes are others than those of the checkpoint.
+    """
+    size = trained.get("image_size")
+    data = ChunkDataModule(
+        task=trained["task"],
+        root=root,
+        setting=trained["setting"],
+        episodes=trained["episodes"],
+        cameras=policy.cameras,
+        image_size=None if size is None else (int(size[0]), int(size[1])),
+        chunk_length=policy.chunk_length,
+        cache="none",
+        split_seed=trained["split_seed"],
+        state=trained["state"],
+        action_offset=trained["action_offset"],
+        after_end=after_end or trained["after_end"],  # type: ignore[arg-type]
+    )
+    data.setup()
+    if data.split != trained["split"]:
+        fix = "Give the folder with the recording that the policy was trained on, with --data."
+        raise DataError(data.folder, "the episodes and seeds of the checkpoint's split", "others", fix)
+    return data

@@ -1,0 +1,123 @@
+"""`ugr analyze`: whether a checkpoint's uncertainty knows the error."""
+
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from ugr_lightning.errors import CheckpointError, ConfigError
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr analyze`."""
+    from ugr_lightning.cli.call import call
+
+    if argv and not argv[0].startswith("-"):  # `ugr analyze CKPT`
+        argv = ["--ckpt_path", *argv]
+    return call(_analyze, command, argv)
+
+
+def _analyze(
+    ckpt_path: str = "best",
+    run: str | None = None,
+    root: str = "runs",
+    data: str = "data/160x120",
+    stride: int = 5,
+    after_end: Literal["mask", "hold"] | None = None,
+    resamples: int = 500,
+    out: str | None = None,
+) -> int:
+    """Say whether a policy's uncertainty knows the error, on the validation episodes of its own split.
+
+    Args:
+        ckpt_path: `best`, `best_loss`, `last`, or a checkpoint file.
+        run: name or folder of a run; null takes the newest run.
+        root: folder of all runs.
+        data: folder of the recordings that the policy was trained on.
+        stride: control steps between two queries.
+        after_end: count steps past the end of an episode (`hold`) or not (`mask`); null does as the training did.
+        resamples: draws of the bootstrap over episodes.
+        out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
+    """
+    from ugr_lightning.analysis import calibration_report as report
+    from ugr_lightning.analysis.calibration_figures import calibration_figure, event_figure
+    from ugr_lightning.analysis.predictions import open_data, predict
+    from ugr_lightning.cli.rollout import newest_run
+    from ugr_lightning.cli.runs import resolve_checkpoint
+    from ugr_lightning.training.checkpoint import load_policy
+
+    for name, value in (("--stride", stride), ("--resamples", resamples)):
+        if value < 1:
+            raise ConfigError(name, "at least 1", value, "Correct the number.")
+    checkpoint = resolve_checkpoint(ckpt_path, run or newest_run(Path(root)), Path(root))
+    policy, info = load_policy(checkpoint)
+    opened = open_data(policy, info.data, data, after_end)
+    fast = policy.for_inference()
+    validation = predict(fast, opened, opened.episode_split.validation, stride=stride)
+    if validation.log_variance is None:
+        fix = "Train with `refine` Uncertainty, or with `uncertainty_head: true`."
+        raise CheckpointError(checkpoint, "a policy with a log-variance per step", "one without", fix)
+    training = predict(fast, opened, opened.episode_split.train, stride=stride)
+    budget = getattr(policy, "budget", None) or int(0.3 * policy.chunk_length)
+    rows = report.compare_with_prior(validation, training, budget, resamples)
+    sentence = report.verdict(rows, len(opened.episode_split.validation), budget)
+    found = report.curves(validation, training)
+    events = report.around_events(validation, opened.demonstrations, resamples)
+    seen = report.generalisation(validation, training, budget)
+    tables = [
+        report.table(rows),
+        report.generalisation_table(seen),
+        report.coverage_table(found),
+        report.event_table(events),
+    ]
+    print(f"checkpoint: {checkpoint}")
+    print("\n\n".join([*map(report.as_text, tables), sentence]))
+    content = {
+        "checkpoint": {"file": str(checkpoint), "sha256": info.sha256, "task": opened.task},
+        "validation": {"episodes": len(opened.episode_split.validation), "chunks": len(validation.step)},
+        "settings": {"stride": stride, "after_end": opened.after_end, "resamples": resamples, "budget": budget},
+        "verdict": sentence,
+        "statistics": [row._asdict() for row in rows],
+        "generalisation": seen,
+        "events": events,
+        **found,
+    }
+    folder = Path(out) if out else checkpoint.with_name(f"analysis-{checkpoint.stem}")
+    figures = {"calibration": calibration_figure(found), **({"events": event_figure(events)} if events else {})}
+    _write(folder, content, tables, figures)
+    print(f"numbers, tables and figures: {folder}")
+    return 0
+
+
+def _write(folder: Path, content: dict[str, Any], tables: list[list[tuple[str, ...]]], figures: dict[str, Any]) -> None:
+    """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
+    from ugr_lightning.analysis.calibration_report import as_markdown
+    from ugr_lightning.data.folder import publish
+
+    text = json.dumps(_plain(content), indent=1, allow_nan=False)
+    prior = json.dumps(_plain(content["position"]["training_error"]))
+    pictures = [f"![{name}]({name}.png)" for name in figures]
+    parts = [
+        f"# Uncertainty of {content['checkpoint']['file']}",
+        content["verdict"],
+        *map(as_markdown, tables),
+        *pictures,
+    ]
+    for name, written in (("analysis.json", text), ("prior.json", prior), ("analysis.md", "\n\n".join(parts))):
+        publish(folder / name, lambda partial, written=written: partial.write_text(written + "\n") and None)
+    for name, figure in figures.items():
+        publish(folder / f"{name}.png", lambda partial, figure=figure: figure.savefig(partial, format="png", dpi=120))
+
+
+def _plain(value: Any) -> Any:
+    """Plain containers for JSON; numbers that are not finite become null."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, dict):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
