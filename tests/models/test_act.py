@@ -10,6 +10,7 @@ from ugr_lightning.models.act import ACT, spatial_softmax
 from ugr_lightning.models.losses import refine_loss
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
+from ugr_lightning.models.refine.oracle import Oracle
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.models.vision import FrozenBatchNorm2d
 
@@ -368,3 +369,23 @@ def test_spatial_softmax_finds_a_peak():
     maps = torch.zeros(1, 1, 5, 9)
     maps[0, 0, 4, 2] = 100
     assert spatial_softmax(maps)[0].tolist() == pytest.approx([-0.5, 1.0])
+
+
+def test_a_policy_that_would_need_the_true_errors_cannot_be_built(tiny):
+    with pytest.raises(ConfigError, match="offline"):
+        tiny(refine=Oracle(), uncertainty_head=True)
+
+
+def test_the_coarse_weight_multiplies_the_coarse_loss_alone(tiny, batch):
+    plain, doubled = tiny(refine=Uncertainty()).eval(), tiny(refine=Uncertainty(), coarse_weight=2.0).eval()
+    first, second = plain.losses(batch), doubled.losses(batch)
+    assert first["coarse"] == second["coarse"]
+    assert torch.isclose(second["loss"] - first["loss"], first["coarse"], rtol=1e-4)
+
+
+def test_base_with_the_parameters_of_uncert_has_exactly_as_many_and_learns_through_the_branch(tiny, batch):
+    control = tiny(refine=Full(), uncertainty_head=True, coarse_weight=0.0)
+    assert parameters(control) == parameters(tiny(refine=Uncertainty()))
+    control.losses(batch)["loss"].backward()
+    assert control.action_head.weight.grad.abs().sum() > 0
+    assert control.branch.head.weight.grad.abs().sum() > 0

@@ -69,6 +69,7 @@ class ACT(ChunkPolicy):
         decoder_readout: which decoder layer is read out: `last`, or `first` as the public ACT code does (then the
             other layers are not built).
         reconstruction: `mse`, summed over the action (paper), or `l1`, averaged over it (public ACT code).
+        coarse_weight: factor on L_coarse, 1 in the paper; controls set it.
         kl_weight: lambda_KL.
         uncertainty_weight: lambda_u.
         cameras: names of the cameras, in the order of the images.
@@ -109,6 +110,7 @@ class ACT(ChunkPolicy):
         causal: bool = False,
         decoder_readout: Literal["last", "first"] = "last",
         reconstruction: Reconstruction = "mse",
+        coarse_weight: float = 1.0,
         kl_weight: float = 10.0,
         uncertainty_weight: float = 1.0,
         cameras: Sequence[str] = CAMERAS,
@@ -140,10 +142,14 @@ class ACT(ChunkPolicy):
         super().__init__()
         if dim % heads or dim % 4:
             raise ConfigError("dim", f"a multiple of heads ({heads}) and of 4", dim, "Change `dim` or `heads`.")
+        if refine is not None and refine.offline:
+            fix = "Compare with it offline: `ugr analyze --budgets`."
+            raise ConfigError("refine", "a rule that knows what a policy knows", type(refine).__name__, fix)
         self.cameras, self.chunk_length = tuple(cameras), chunk_length
         self.state_dim, self.action_dim, self.latent_dim = state_dim, action_dim, latent_dim
         self.refine, self.refine_detach_coarse, self.causal = refine, refine_detach_coarse, causal
         self.reconstruction, self.kl_weight, self.uncertainty_weight = reconstruction, kl_weight, uncertainty_weight
+        self.coarse_weight = coarse_weight
         self.state_dropout, self.state_noise = state_dropout, state_noise
         self.image_shift, self.color_jitter = image_shift, color_jitter
         self.position_in_values, self.precision = position_in_values, precision
@@ -215,7 +221,12 @@ class ACT(ChunkPolicy):
             terms["uncertainty"] = uncertainty_loss(plan.coarse, target, plan.log_variance, batch.valid)
         if posterior is not None:
             terms["kl"] = kl_loss(*posterior)
-        total = total_loss(terms, uncertainty_weight=self.uncertainty_weight, kl_weight=self.kl_weight)
+        total = total_loss(
+            terms,
+            coarse_weight=self.coarse_weight,
+            uncertainty_weight=self.uncertainty_weight,
+            kl_weight=self.kl_weight,
+        )
         return {"loss": total, **terms}
 
     @torch.no_grad()

@@ -79,13 +79,16 @@ def kl_loss(mean: Tensor, log_variance: Tensor) -> Tensor:
     return (-0.5 * (1 + log_variance - mean.square() - log_variance.exp())).sum(-1).mean()
 
 
-def total_loss(terms: dict[str, Tensor], *, uncertainty_weight: float, kl_weight: float) -> Tensor:
+def total_loss(
+    terms: dict[str, Tensor], *, uncertainty_weight: float, kl_weight: float, coarse_weight: float = 1.0
+) -> Tensor:
     """L = L_coarse + L_refine + lambda_u L_uncert + lambda_KL L_KL.
 
     Args:
         terms: `coarse`, and those of `refine`, `uncertainty`, `kl` that the policy has.
         uncertainty_weight: lambda_u.
         kl_weight: lambda_KL.
+        coarse_weight: 1 in the paper.
     """
-    weights = {"coarse": 1.0, "refine": 1.0, "uncertainty": uncertainty_weight, "kl": kl_weight}
+    weights = {"coarse": coarse_weight, "refine": 1.0, "uncertainty": uncertainty_weight, "kl": kl_weight}
     return torch.stack([weights[name] * term for name, term in terms.items()]).sum()
