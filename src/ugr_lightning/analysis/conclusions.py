@@ -1,0 +1,161 @@
+"""What may be concluded from a report and what may not, in words made from its numbers."""
+
+from dataclasses import dataclass
+
+from ugr_lightning.analysis.power import LARGEST, paired_episodes
+from ugr_lightning.analysis.report import ALL_TASKS, Contest, Report
+from ugr_lightning.errors import ConfigError
+
+LEVEL = 0.05
+MARGIN = 0.10
+"""Comparisons that leave room for a larger difference than this have too few episodes to say that there is none."""
+ENOUGH_TRAINING_SEEDS = 3
+
+
+@dataclass(frozen=True)
+class Conclusion:
+    """Sentences.
+
+    Args:
+        may: what the numbers support.
+        may_not: what they do not.
+    """
+
+    may: list[str]
+    may_not: list[str]
+
+    def __str__(self) -> str:
+        parts = (("What may be concluded:", self.may), ("What may not:", self.may_not))
+        return "\n\n".join(f"**{title}** {' '.join(sentences)}" for title, sentences in parts if sentences)
+
+
+def conclude(report: Report) -> Conclusion:
+    """Put a report into words; where there are several tasks, the comparison over all of them decides.
+
+    Args:
+        report: rates and contests; significance is that of the corrected p-values, level 5 %.
+    """
+    may: list[str] = []
+    may_not: list[str] = []
+    pooled = {contest.mode for contest in report.contests if contest.task == ALL_TASKS}
+    decisive = [c for c in report.contests if (c.task == ALL_TASKS) == (c.mode in pooled)]
+    for contest in decisive:
+        (may if _differs(contest) or _is_close(contest) else may_not).append(_verdict(contest))
+    may += _single_tasks([c for c in report.contests if c not in decisive])
+    if not decisive:
+        may_not.append(_nothing_to_compare(report))
+    else:
+        may_not += _scope(decisive)
+    return Conclusion(may, may_not)
+
+
+def _differs(contest: Contest) -> bool:
+    return contest.p_holm < LEVEL
+
+
+def _is_close(contest: Contest) -> bool:
+    """Whether a difference of the margin or more is excluded, by more than the lack of any differing episode."""
+    return max(-contest.low, contest.high) < MARGIN and contest.seeds * MARGIN >= ENOUGH_TRAINING_SEEDS
+
+
+def _verdict(contest: Contest) -> str:
+    if _differs(contest):
+        better, worse = (contest.a, contest.b) if contest.difference > 0 else (contest.b, contest.a)
+        return (
+            f"`{better}` succeeds more often than `{worse}` {_where(contest)}: {_numbers(contest)}. {_again(contest)}"
+        )
+    if _is_close(contest):
+        largest = max(-contest.low, contest.high)
+        return (
+            f"`{contest.a}` and `{contest.b}` differ by less than {largest:.0%} {_where(contest)}, and no difference is "
+            f"shown: {_numbers(contest)}."
+        )
+    return (
+        f"Whether `{contest.a}` or `{contest.b}` is better {_where(contest)}: {_numbers(contest)}; anything from "
+        f"{contest.low:+.0%} to {contest.high:+.0%} is compatible with these episodes, which are too few. {_needed(contest)}"
+    )
+
+
+def _where(contest: Contest) -> str:
+    place = f"over {contest.tasks} tasks" if contest.task == ALL_TASKS else f"in {contest.task}"
+    return f"{place} ({contest.mode.setting}, {described_execution(contest.mode.execution)})"
+
+
+def described_execution(execution: str) -> str:
+    """`aggregate` or a number of steps in words."""
+    return "aggregated chunks" if execution == "aggregate" else f"{execution} steps of each chunk"
+
+
+def _numbers(contest: Contest) -> str:
+    seeds = f"{contest.seeds} seeds"
+    if contest.training_seeds > 1:
+        seeds += f" x {contest.training_seeds} training seeds"
+    return (
+        f"{contest.rate_a:.1%} against {contest.rate_b:.1%}, difference {contest.difference:+.1%} "
+        f"[{contest.low:+.1%}, {contest.high:+.1%}], n = {seeds}, {contest.only_a} against {contest.only_b} episodes, "
+        f"p = {contest.p_holm:.3g} after correction"
+    )
+
+
+def _again(contest: Contest) -> str:
+    """Whether a difference between checkpoints is one between ways of training."""
+    n = contest.training_seeds
+    if n == 1:
+        return "That is said of these checkpoints: with one training seed nothing is known about training again."
+    if contest.low <= 0 <= contest.high:
+        return f"Over its {n} training seeds the difference varies so much that another training could show none."
+    if n < ENOUGH_TRAINING_SEEDS:
+        return f"{n} training seeds agree, which are too few to know how much training again would vary."
+    return f"It holds over {n} training seeds."
+
+
+def _needed(contest: Contest) -> str:
+    differing = (contest.only_a + contest.only_b) / (contest.seeds * contest.training_seeds)
+    size = abs(contest.difference)
+    if size < 0.005 or differing < size - 1e-9:  # tasks of unequal size weigh the same in one and not in the other
+        return ""
+    try:
+        return (
+            f"A difference of the size seen takes about {paired_episodes(size, max(size, differing))} shared seeds to be found with "
+            "80 % power."
+        )
+    except ConfigError:
+        return f"A difference of the size seen takes more than {LARGEST} shared seeds."
+
+
+def _single_tasks(contests: list[Contest]) -> list[str]:
+    """One sentence on the tasks that show a difference by themselves."""
+    found = [c for c in contests if _differs(c)]
+    if not found:
+        return []
+    named = [
+        f"`{c.a if c.difference > 0 else c.b}` over `{c.b if c.difference > 0 else c.a}` {_where(c)} (p = {c.p_holm:.3g})"
+        for c in found
+    ]
+    return [f"By themselves these tasks show a difference between the checkpoints: {'; '.join(named)}."]
+
+
+def _nothing_to_compare(report: Report) -> str:
+    if not report.rates:
+        return "Anything: there are no episodes."
+    return "Which policy is better: no two policies were evaluated in the same task, mode, seeds and training seeds."
+
+
+def _scope(contests: list[Contest]) -> list[str]:
+    fewest = min(contest.training_seeds for contest in contests)
+    sentences = []
+    if fewest == 1:
+        sentences.append(
+            "That one way of training is better than another: one training seed shows one checkpoint each, and the "
+            "intervals say nothing about how training again would vary."
+        )
+    elif fewest < ENOUGH_TRAINING_SEEDS:
+        sentences.append(
+            f"How much the rates vary from training to training: {fewest} training seeds underestimate it, and the "
+            "intervals are too narrow by an unknown amount."
+        )
+    if max(contest.tasks for contest in contests) == 1:
+        sentences.append("Anything about other tasks: each comparison is of one.")
+    else:
+        sentences.append("Anything about other tasks: the tasks are taken as given, not as a sample.")
+    return sentences

@@ -1,0 +1,120 @@
+"""`ugr report`: results to Markdown, CSV and one HTML page, and how many episodes a comparison needs."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+
+from ugr_lightning.errors import ConfigError
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr report`."""
+    from ugr_lightning.cli.call import call
+
+    return call(_report, command, _gathered(argv, first="paths", several=("paths", "runs", "power")))
+
+
+def _report(
+    paths: list[str] = [],  # noqa: B006 - jsonargparse copies it
+    runs: list[str] = [],  # noqa: B006
+    baseline: str | None = None,
+    out: str | None = None,
+    title: str = "Results",
+    power: list[float] | None = None,
+    discordance: float | None = None,
+) -> int:
+    """Compare policies: success with intervals, paired tests, and what may be concluded from them.
+
+    Args:
+        paths: results folders of `ugr benchmark`.
+        runs: single results files, each `NAME=FILE`; one name may occur for several training seeds.
+        baseline: compare the others with this policy only; null compares all pairs.
+        out: folder for `report.md`, `report.html`, `rates.csv` and `comparisons.csv`; null prints Markdown.
+        title: heading of the report.
+        power: instead of a report, the episodes needed to tell two success rates apart, such as `0.90 0.95`.
+        discordance: with `power`, the share of shared seeds on which exactly one policy succeeds; null for a table.
+    """
+    if power is not None:
+        return _plan(power, discordance)
+    if not paths and not runs:
+        fix = "Give a results folder of `ugr benchmark`, or --runs base=runs/base/version_0/evaluation.jsonl ..."
+        raise ConfigError("ugr report", "results", "none", fix)
+    from ugr_lightning.analysis.report import build_report
+    from ugr_lightning.analysis.report_pages import to_markdown, write_report
+    from ugr_lightning.rollout.evaluations import read_benchmark, read_labelled
+
+    evaluations = [item for path in paths for item in read_benchmark(path)]
+    for text in runs:
+        label, separator, path = text.partition("=")
+        if not separator or not label or not path:
+            raise ConfigError(
+                "--runs", "NAME=FILE", text, "For example --runs base=runs/base/version_0/evaluation.jsonl"
+            )
+        evaluations.append(read_labelled(label, path))
+    report = build_report(evaluations, baseline=baseline)
+    if out is None:
+        print(to_markdown(report, title), end="")
+    else:
+        for path in write_report(report, Path(out), title):
+            print(path)
+    return 0
+
+
+def _plan(power: list[float], discordance: float | None) -> int:
+    from ugr_lightning.analysis.power import plan
+
+    if len(power) != 2:
+        raise ConfigError("--power", "two success rates, such as 0.90 0.95", power, "Give both.")
+    a, b = power
+    largest = a * (1 - b) + b * (1 - a)
+    shares = (
+        {"as given": discordance}
+        if discordance is not None
+        else {
+            "the outcomes are independent": largest,
+            "half as many seeds differ": max(abs(a - b), largest / 2),
+            "the worse one never wins": abs(a - b),
+        }
+    )
+    print(f"Episodes of each policy to tell {a:.1%} from {b:.1%}: two-sided level 5 %, power 80 %\n")
+    print(f"{'each on seeds of its own':<52}{plan(a, b, discordance=discordance).unpaired:>8}")
+    for name, share in shares.items():
+        needed = plan(a, b, discordance=share).paired
+        print(f"{f'shared seeds, {share:.1%} of them differ ({name})':<52}{needed:>8}")
+    return 0
+
+
+def _gathered(argv: Sequence[str], *, first: str, several: Sequence[str]) -> list[str]:
+    """Let some options take several words, `--power 0.9 0.95`; words before the first option belong to `first`."""
+    gathered: list[str] = []
+    words: list[str] = []
+    name: str | None = first
+
+    def close() -> None:
+        if name is not None and words:
+            numbers = name == "power"
+            listed = json.dumps([_number(word) if numbers else word for word in words])
+            gathered.extend([f"--{name}", words[0] if words[0].startswith("[") else listed])
+        words.clear()
+
+    for argument in argv:
+        if argument.startswith("--"):
+            close()
+            option = argument.removeprefix("--").partition("=")[0]
+            name = option if option in several and "=" not in argument else None
+            if name is None:
+                gathered.append(argument)
+        elif name is None:
+            gathered.append(argument)
+        else:
+            words.append(argument)
+    close()
+    return gathered
+
+
+def _number(word: str) -> str | float:
+    """A number where it is one; the parser complains about anything else and names the option."""
+    try:
+        return float(word)
+    except ValueError:
+        return word

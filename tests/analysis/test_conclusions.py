@@ -1,0 +1,85 @@
+import pytest
+from made_up import drawn, evaluation
+
+from ugr_lightning.analysis.conclusions import conclude
+from ugr_lightning.analysis.report import build_report
+
+
+def words(*runs):
+    conclusion = conclude(build_report(runs))
+    return " ".join(conclusion.may), " ".join(conclusion.may_not)
+
+
+def test_a_clear_winner_of_one_training_seed_is_one_between_checkpoints():
+    may, may_not = words(drawn("base", 0.5, seed=1), drawn("uncert", 0.9, seed=2))
+    assert "`uncert` succeeds more often than `base` in click_alarmclock" in may
+    assert "of these checkpoints" in may
+    assert "one training seed shows one checkpoint each" in may_not
+
+
+def test_the_winner_is_named_whichever_comes_first():
+    may, _ = words(drawn("uncert", 0.9, seed=2), drawn("base", 0.5, seed=1))
+    assert "`uncert` succeeds more often than `base`" in may
+
+
+def test_a_clear_winner_over_training_seeds_is_one_between_trainings():
+    runs = [drawn("base", 0.5, seed=t, training_seed=t) for t in range(4)]
+    runs += [drawn("uncert", 0.9, seed=9 + t, training_seed=t) for t in range(4)]
+    may, may_not = words(*runs)
+    assert "It holds over 4 training seeds" in may
+    assert "training" not in may_not
+
+
+def test_two_training_seeds_are_called_too_few():
+    runs = [drawn(p, r, seed=t, training_seed=t) for p, r in (("base", 0.3), ("uncert", 0.9)) for t in range(2)]
+    may, may_not = words(*runs)
+    assert "too few to know how much training again would vary" in may
+    assert "2 training seeds underestimate it" in may_not
+
+
+def test_training_seeds_that_disagree_do_not_make_a_winner_of_the_training():
+    solved = [[1] * n + [0] * (100 - n) for n in (100, 40, 100, 40)]
+    runs = [evaluation("uncert", outcomes, training_seed=t) for t, outcomes in enumerate(solved)]
+    runs += [evaluation("base", [1] * 50 + [0] * 50, training_seed=t) for t in range(4)]
+    may, _ = words(*runs)
+    assert "another training could show none" in may
+
+
+def test_no_difference_on_many_seeds_bounds_the_difference():
+    may, may_not = words(drawn("base", 0.9, n=800, seed=1), drawn("uncert", 0.9, n=800, seed=1))
+    assert "differ by less than" in may
+    assert "more often" not in may
+    assert "too few" not in may_not
+
+
+def test_too_few_episodes_say_nothing_and_how_many_would():
+    may, may_not = words(evaluation("base", [1] * 7 + [0] * 3), evaluation("uncert", [0] * 2 + [1] * 7 + [0]))
+    assert may == ""
+    assert "Whether `uncert` or `base` is better" in may_not
+    assert "are too few" in may_not
+    fewer = words(evaluation("base", [1] * 5 + [0] * 5), evaluation("uncert", [1] * 8 + [0] * 2))[1]
+    assert "shared seeds to be found with 80 % power" in fewer
+
+
+def test_ten_episodes_that_agree_do_not_show_that_policies_are_equal():
+    may, may_not = words(*(evaluation(p, [1] * 10, training_seed=t) for p in ("base", "uncert") for t in (0, 1)))
+    assert may == ""
+    assert "too few" in may_not
+
+
+def test_with_several_tasks_the_pooled_comparison_decides_and_single_tasks_are_mentioned():
+    runs = []
+    for number, task in enumerate(("click_alarmclock", "handover_block")):
+        runs += [drawn("base", 0.4, seed=number, task=task), drawn("uncert", 0.9, seed=9 + number, task=task)]
+    may, may_not = words(*runs)
+    assert "over 2 tasks" in may
+    assert "By themselves these tasks show a difference" in may
+    assert "not as a sample" in may_not
+
+
+@pytest.mark.parametrize(
+    ("runs", "said"),
+    [([], "there are no episodes"), ([evaluation("base", [1])], "no two policies were evaluated in the same task")],
+)
+def test_without_a_comparison_it_says_so(runs, said):
+    assert said in words(*runs)[1]

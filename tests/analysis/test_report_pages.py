@@ -1,0 +1,69 @@
+import csv
+import re
+from html.parser import HTMLParser
+
+from made_up import drawn
+
+from ugr_lightning.analysis.report import build_report
+from ugr_lightning.analysis.report_pages import to_html, to_markdown, write_report
+
+
+def table2():
+    return build_report(
+        [
+            drawn(policy, rate, n=30, seed=t, training_seed=t)
+            for policy, rate in (("base", 0.5), ("uncert", 0.9), ("<b>|", 0.7))
+            for t in (0, 1)
+        ]
+    )
+
+
+def test_markdown_has_a_row_for_every_rate_and_comparison():
+    text = to_markdown(table2(), "Table 2")
+    assert text.startswith("# Table 2\n\n## Conclusion\n\n**What may be concluded:**")
+    rows = [line for line in text.splitlines() if line.startswith("| click")]
+    assert len(rows) == 3 + 3
+    assert all(len(re.split(r"(?<!\\)\|", row)) == len(re.split(r"(?<!\\)\|", rows[0])) for row in rows[:3])
+    assert re.search(r"\| `base` \| \d+/60 = [\d.]+% \| \[[\d.]+%, [\d.]+%\] \| 0: \d+/30, 1: \d+/30 \| 0 \|", text)
+
+
+class Page(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.ids, self.loads, self.used = [], [], [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.tags.append(tag)
+        for name, value in attributes:
+            if name == "id":
+                self.ids.append(value)
+            if name in ("src", "href", "xlink:href"):
+                (self.used if value.startswith("#") else self.loads).append(value)
+            self.used += re.findall(r"url\((#[^)]+)\)", value or "")
+
+
+def test_the_page_needs_no_other_file_and_its_drawings_do_not_disturb_each_other():
+    page = Page(to_html(table2(), "a & b"))
+    assert page.tags.count("svg") == 2
+    assert page.loads == []
+    assert {"script", "link", "img", "b"}.isdisjoint(page.tags)
+    assert len(page.ids) == len(set(page.ids))
+    assert page.used
+    assert {name.removeprefix("#") for name in page.used} <= set(page.ids)
+
+
+def test_equal_results_give_an_equal_page():
+    assert to_html(table2(), "t") == to_html(table2(), "t")
+
+
+def test_csv_files_hold_the_numbers_unrounded(tmp_path):
+    report = table2()
+    paths = write_report(report, tmp_path / "new", "t")
+    assert [path.name for path in paths] == ["report.md", "report.html", "rates.csv", "comparisons.csv"]
+    rates = list(csv.DictReader(paths[2].open()))
+    assert len(rates) == 3 * 3
+    assert float(rates[2]["low"]) == report.rates[0].total.low
+    contests = list(csv.DictReader(paths[3].open()))
+    assert [float(row["p_holm"]) for row in contests] == [contest.p_holm for contest in report.contests]
+    assert contests[0]["execution"] == "aggregate"

@@ -1,0 +1,66 @@
+import pytest
+
+from ugr_lightning.cli.main import main
+from ugr_lightning.contract import EpisodeResult
+from ugr_lightning.rollout.results import append_result
+
+
+@pytest.fixture
+def files(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for policy, successes in (("base", 10), ("uncert", 18)):
+        for seed in range(20):
+            result = EpisodeResult(
+                "click_alarmclock", "demo_clean", seed, "hash", "ACT", policy, "25", seed < successes, 9
+            )
+            append_result(f"{policy}.jsonl", result)
+    return ["--runs", "base=base.jsonl", "uncert=uncert.jsonl"]
+
+
+def test_a_report_is_printed_or_written(files, tmp_path, capsys):
+    assert main(["report", *files]) == 0
+    said = capsys.readouterr().out
+    assert "`uncert` succeeds more often than `base`" in said
+    assert "18/20 = 90.0%" in said
+    assert main(["report", *files, "--out", "new", "--title", "Ours"]) == 0
+    assert {path.name for path in (tmp_path / "new").iterdir()} == {
+        "report.md",
+        "report.html",
+        "rates.csv",
+        "comparisons.csv",
+    }
+    assert "Ours" in (tmp_path / "new" / "report.html").read_text()
+
+
+def test_a_broken_line_is_named(files, tmp_path, capsys):
+    with (tmp_path / "base.jsonl").open("a") as file:
+        file.write("{broken\n")
+    assert main(["report", *files]) == 2
+    assert "base.jsonl, line 21" in capsys.readouterr().err
+
+
+def test_the_power_calculator_knows_paired_and_unpaired(capsys):
+    assert main(["report", "--power", "0.90", "0.95"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[2].split()[-1] == "435"
+    assert len(lines) == 6
+    assert main(["report", "--power", "0.90", "0.95", "--discordance", "0.05"]) == 0
+    few = capsys.readouterr().out.splitlines()
+    assert few[3].split()[-1] == lines[5].split()[-1]
+
+
+@pytest.mark.parametrize(
+    ("argv", "said"),
+    [
+        ([], "results"),
+        (["--runs", "base.jsonl"], "NAME=FILE"),
+        (["nowhere"], "nowhere"),
+        (["--power", "0.9"], "two success rates"),
+        (["--power", "0.9", "high"], "power"),
+        (["--bseline", "x"], "`baseline`"),
+    ],
+)
+def test_what_is_wrong_is_explained(argv, said, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", *argv]) == 2
+    assert said in capsys.readouterr().err
