@@ -68,6 +68,11 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
     assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
 
 
+def test_a_budget_for_a_dummy_is_refused(world, capsys):
+    assert main(["rollout", "--policy", "zero", "--task", "click_alarmclock", "--refine_ratio", "0.5"]) == 2
+    assert "--refine_ratio" in capsys.readouterr().err
+
+
 def test_seed_lists_are_what_they_say():
     evaluation, whole = seed_list("evaluation", "click_alarmclock", 5)
     assert evaluation == whole[:5]

@@ -39,6 +39,34 @@ def test_online_aggregation_is_exact_when_some_steps_are_not_queried():
     assert np.abs(online(TemporalAggregation(K, A, 0.3), chunks) - offline(chunks, 0.3)).max() < 1e-6
 
 
+def test_weights_by_variance_are_those_of_the_table_times_the_inverse_variance():
+    rng = np.random.default_rng(3)
+    chunks, log_variance = rng.normal(size=(T, K, A)), rng.normal(size=(T, K))
+    aggregation = TemporalAggregation(K, A, 0.3, by_variance=True)
+    for step in range(T):
+        aggregation.push(0, chunks[step], log_variance[step].astype(np.float32))
+        queries = np.arange(max(0, step - K + 1), step + 1)
+        weights = np.exp(-0.3 * np.arange(len(queries)) - log_variance[queries, step - queries])
+        expected = (chunks[queries, step - queries] * weights[:, None]).sum(0) / weights.sum()
+        assert np.allclose(aggregation.next(0), expected, atol=1e-5)
+
+
+def test_equal_variances_change_nothing_and_a_very_uncertain_prediction_is_ignored():
+    plain, weighted = TemporalAggregation(2, 1), TemporalAggregation(2, 1, by_variance=True)
+    for aggregation in (plain, weighted):
+        aggregation.push(0, np.array([[0.0], [1.0]]), np.full(2, -3.0))
+        aggregation.next(0)
+        aggregation.push(0, np.array([[4.0], [0.0]]), np.full(2, -3.0))
+    assert plain.next(0) == pytest.approx(weighted.next(0))
+    weighted.push(0, np.array([[100.0], [0.0]]), np.array([10.0, 0.0]))
+    assert weighted.next(0)[0] == pytest.approx(0, abs=0.01)
+
+
+def test_weights_by_variance_need_a_policy_that_predicts_one():
+    with pytest.raises(ConfigError, match="log-variance"):
+        TemporalAggregation(K, A, by_variance=True).push(0, np.zeros((K, A)))
+
+
 def test_oldest_prediction_weighs_most():
     aggregation = TemporalAggregation(2, 1, decay=1.0)
     aggregation.push(0, np.array([[0.0], [1.0]]))
@@ -87,6 +115,8 @@ def test_asking_for_an_action_without_a_chunk_is_an_error(execution):
 
 def test_execution_is_parsed_from_a_word_or_a_number():
     assert isinstance(make_execution("aggregate", K, A), TemporalAggregation)
+    assert make_execution("aggregate", K, A).name == "aggregate"
+    assert make_execution("aggregate-variance", K, A).name == "aggregate-variance"
     assert make_execution("3", K, A).name == make_execution(3, K, A).name == "3"
     for wrong in ("agregate", 0, K + 1, "-2", "2.5", True):
         with pytest.raises(ConfigError, match="execution"):

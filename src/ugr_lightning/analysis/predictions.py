@@ -109,6 +109,7 @@ def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end
         image_size=None if size is None else (int(size[0]), int(size[1])),
         chunk_length=policy.chunk_length,
         cache="none",
+        observation_steps=policy.observation_steps,
         split_seed=trained["split_seed"],
         state=trained["state"],
         action_offset=trained["action_offset"],

@@ -9,18 +9,22 @@ from ugr_lightning.cli.runs import resolve_checkpoint
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
 
+ExecutionName = Literal["aggregate", "aggregate-variance"] | int
+
 
 def _rollout(
     task: str | None = None,
     policy: str = "expert",
     seeds: Literal["evaluation", "selection"] | int = "evaluation",
     episodes: int | None = None,
-    execution: Literal["aggregate"] | int = "aggregate",
+    execution: ExecutionName = "aggregate",
     setting: str | None = None,
     image_size: tuple[int, int] | None = None,
     workers: int = 2,
     video: str | None = None,
     out: str | None = None,
+    traces: str | None = None,
+    refine_ratio: float | None = None,
 ) -> int:
     """Let a policy act in a task and count its successes.
 
@@ -29,12 +33,15 @@ def _rollout(
         policy: `zero`, `random`, `expert`, or a checkpoint file.
         seeds: `evaluation` (the task's fixed list), `selection` (for choices of a recipe), or the first seed.
         episodes: how many of those seeds; null means 100, or 1 where only a video is asked for.
-        execution: `aggregate`, or the number of steps executed of each chunk.
+        execution: `aggregate`; `aggregate-variance`, which also weights by the predicted variance; or the number of
+            steps executed of each chunk.
         setting: `demo_clean` or `demo_randomized`; null takes the checkpoint's.
         image_size: height and width of the pictures; null takes the checkpoint's.
         workers: simulator processes.
         video: file for an animated GIF of the first episode.
         out: results file, one JSON line per episode is appended.
+        traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
+        refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
     """
     from ugr_lightning.rollout.results import success_table
 
@@ -53,6 +60,8 @@ def _rollout(
         workers=workers,
         video=None if video is None else Path(video),
         out=None if out is None else Path(out),
+        traces=None if traces is None else Path(traces),
+        refine_ratio=refine_ratio,
     )
     print(success_table(results))
     return 0
@@ -70,6 +79,8 @@ def roll_out(
     workers: int = 2,
     video: Path | None = None,
     out: Path | None = None,
+    traces: Path | None = None,
+    refine_ratio: float | None = None,
 ) -> list[EpisodeResult]:
     """Roll out a dummy or a checkpoint; see `ugr rollout`.
 
@@ -81,9 +92,12 @@ def roll_out(
     import tempfile
 
     from ugr_lightning.contract import CAMERAS
+    from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.rollout.actors import DUMMIES, Actor, PolicyActor, make_actor
+    from ugr_lightning.rollout.lockstep import EpisodeTrace
     from ugr_lightning.rollout.results import append_result
     from ugr_lightning.rollout.runner import run_episodes
+    from ugr_lightning.rollout.traces import write_trace
     from ugr_lightning.sim.render import require_rendering
     from ugr_lightning.sim.seeds import seeds_hash
     from ugr_lightning.training.checkpoint import load_policy
@@ -92,6 +106,8 @@ def roll_out(
     trained: dict[str, object] = {}
     sha = None
     if policy in DUMMIES:
+        if refine_ratio is not None:
+            raise ConfigError("--refine_ratio", "a checkpoint to refine less or more", policy, "Give one by --policy.")
         actor = make_actor(policy)
     else:
         if not Path(policy).is_file() and not policy.endswith(".ckpt"):
@@ -101,14 +117,23 @@ def roll_out(
         missing = sorted(set(model.cameras) - set(CAMERAS))
         if missing:
             raise ConfigError("cameras", f"cameras of the simulator, {CAMERAS}", missing, "Use another checkpoint.")
-        trained, sha = info.data, info.sha256
-        actor = PolicyActor(model.for_inference(), name=type(model).__name__, state=trained.get("state", "commanded"))  # type: ignore[arg-type]
+        trained, sha, name = info.data, info.sha256, type(model).__name__
+        if refine_ratio is not None:
+            model, name = with_refine_ratio(model, refine_ratio), f"{name}(refine_ratio={refine_ratio:g})"
+        actor = PolicyActor(model.for_inference(), name=name, state=trained.get("state", "commanded"))  # type: ignore[arg-type]
     task = task or trained.get("task")  # type: ignore[assignment]
     if task is None:
         raise ConfigError("--task", "a task", "none", "`ugr tasks` lists them.")
     if actor.cameras or video is not None:
         require_rendering()
     wanted, whole = seed_list(seeds, str(task), episodes)
+
+    def keep(result: EpisodeResult, trace: EpisodeTrace) -> None:
+        if out is not None:
+            append_result(out, result)
+        if traces is not None:
+            write_trace(traces, result, trace)
+
     with tempfile.TemporaryDirectory() as scratch:
         results = run_episodes(
             actor,
@@ -120,7 +145,7 @@ def roll_out(
             workers=min(workers, len(wanted)),
             checkpoint=sha,
             seeds_hash=seeds_hash(whole),
-            on_result=None if out is None else lambda result, trace: append_result(out, result),
+            on_result=keep,
             video_dir=scratch if video is not None else None,
             video_seeds=wanted[:1],
         )
@@ -162,9 +187,11 @@ def _test(
     root: str = "runs",
     task: str | None = None,
     episodes: int = 100,
-    executions: list[Literal["aggregate"] | int] = ["aggregate", 25],  # noqa: B006 - jsonargparse copies it
+    executions: list[ExecutionName] = ["aggregate", 25],  # noqa: B006 - jsonargparse copies it
     workers: int = 2,
     out: str | None = None,
+    traces: str | None = None,
+    refine_ratio: float | None = None,
 ) -> int:
     """Success of a checkpoint on the task's evaluation seeds, with aggregated chunks and with executed ones.
 
@@ -174,9 +201,11 @@ def _test(
         root: folder of all runs.
         task: a name from `ugr tasks`; null takes the task the checkpoint was trained on.
         episodes: how many of the 100 evaluation seeds.
-        executions: each `aggregate`, or the number of steps executed of each chunk.
+        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk.
         workers: simulator processes.
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
+        traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
+        refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
     """
     from ugr_lightning.rollout.results import success_table
 
@@ -186,7 +215,15 @@ def _test(
     for execution in executions:
         file = Path(out) if out else checkpoint.with_name("evaluation.jsonl")
         results += roll_out(
-            str(checkpoint), task, seeds="evaluation", episodes=episodes, execution=execution, workers=workers, out=file
+            str(checkpoint),
+            task,
+            seeds="evaluation",
+            episodes=episodes,
+            execution=execution,
+            workers=workers,
+            out=file,
+            traces=None if traces is None else Path(traces),
+            refine_ratio=refine_ratio,
         )
     print(success_table(results))
     return 0

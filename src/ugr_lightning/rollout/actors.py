@@ -43,7 +43,7 @@ class Actor(ABC):
 
         Args:
             slots: number of slots.
-            execution: `aggregate` or the number of steps executed of each chunk.
+            execution: `aggregate`, `aggregate-variance` or the number of steps executed of each chunk.
         """
 
     def end(self) -> None:  # noqa: B027 - most have nothing to tidy up
@@ -180,9 +180,9 @@ class PolicyActor(Actor):
         if asking:
             chunks, log_variance = self._query()
             for slot in asking:
-                self._execution.push(slot, chunks[slot])
                 if log_variance is not None:
                     uncertainty[slot] = log_variance[slot]
+                self._execution.push(slot, chunks[slot], uncertainty.get(slot))
         return {slot: Decision(self._execution.next(slot), uncertainty.get(slot)) for slot in frames}
 
     def _see(self, slot: int, frame: Any) -> None:

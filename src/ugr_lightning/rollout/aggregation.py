@@ -8,6 +8,7 @@ from ugr_lightning.contract import ACTION_DIM
 from ugr_lightning.errors import ConfigError
 
 AGGREGATE = "aggregate"
+AGGREGATE_VARIANCE = "aggregate-variance"
 
 
 class Execution(ABC):
@@ -27,8 +28,8 @@ class Execution(ABC):
         """Whether the slot wants a new chunk before its next action."""
 
     @abstractmethod
-    def push(self, slot: int, chunk: np.ndarray) -> None:
-        """Give a slot the chunk (K, A) that was predicted at its current step."""
+    def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
+        """Give a slot the chunk (K, A), and s_k (K,) if there is one, that was predicted at its current step."""
 
     @abstractmethod
     def next(self, slot: int) -> np.ndarray:
@@ -38,6 +39,8 @@ class Execution(ABC):
 class TemporalAggregation(Execution):
     """Average of all predictions that were made for a step, weighted exp(-decay i), i = 0 for the oldest.
 
+    With `by_variance`, the weight of a prediction is also exp(-s), the inverse of the variance predicted for it.
+
     Kept online as K running sums per slot: a prediction that arrives later always has a larger i, so the weights of
     the earlier ones never change. Needs O(K A) memory where the table of the public codes needs O(T (T + K) A).
 
@@ -46,14 +49,21 @@ class TemporalAggregation(Execution):
         action_dim: A.
         decay: weight decay per prediction; positive means that older predictions count more.
         slots: number of environment slots.
+        by_variance: trust a prediction less the more uncertain it is.
 
     Source: FACTS 6.1; DESIGN 4.
     """
 
-    name = AGGREGATE
-
-    def __init__(self, chunk_length: int, action_dim: int = ACTION_DIM, decay: float = 0.01, slots: int = 1) -> None:
-        self._decay = decay
+    def __init__(
+        self,
+        chunk_length: int,
+        action_dim: int = ACTION_DIM,
+        decay: float = 0.01,
+        slots: int = 1,
+        by_variance: bool = False,
+    ) -> None:
+        self.name = AGGREGATE_VARIANCE if by_variance else AGGREGATE
+        self._decay, self._by_variance = decay, by_variance
         self._sums = np.zeros((slots, chunk_length, action_dim))  # float64: sums of up to K terms
         self._weights = np.zeros((slots, chunk_length))
         self._counts = np.zeros((slots, chunk_length))
@@ -67,11 +77,20 @@ class TemporalAggregation(Execution):
         """Always: every step is predicted anew."""
         return True
 
-    def push(self, slot: int, chunk: np.ndarray) -> None:
-        """Add a chunk (K, A) that starts at the slot's current step."""
+    def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
+        """Add a chunk (K, A) that starts at the slot's current step, with s_k (K,) where weights depend on it.
+
+        Raises:
+            ConfigError: a chunk of another shape; or weights by variance for a policy that predicts none.
+        """
         if chunk.shape != self._sums.shape[1:]:
             raise ConfigError("chunk", self._sums.shape[1:], chunk.shape, "Build the aggregation for this policy.")
         weights = np.exp(-self._decay * self._counts[slot])  # (K,)
+        if self._by_variance:
+            if log_variance is None:
+                fix = f"Execute this policy with `{AGGREGATE}` or a number of steps."
+                raise ConfigError(f"execution {self.name}", "a policy with a log-variance per step", "none", fix)
+            weights = weights * np.exp(-log_variance.astype(np.float64))  # (K,)
         self._sums[slot] += weights[:, None] * chunk  # (K, A)
         self._weights[slot] += weights
         self._counts[slot] += 1
@@ -109,7 +128,7 @@ class ChunkExecution(Execution):
         """True at the start of an episode and whenever the steps of the last chunk are used up."""
         return self._chunks[slot] is None or self._cursors[slot] >= self._steps
 
-    def push(self, slot: int, chunk: np.ndarray) -> None:
+    def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
         """Replace the slot's chunk by a new one (K, A)."""
         self._chunks[slot], self._cursors[slot] = np.array(chunk, np.float32), 0
 
@@ -126,18 +145,18 @@ def make_execution(execution: str | int, chunk_length: int, action_dim: int = AC
     """Build what the setting `execution` names.
 
     Args:
-        execution: `aggregate`, or the number of steps (1 .. K) executed of each chunk.
+        execution: `aggregate`, `aggregate-variance`, or the number of steps (1 .. K) executed of each chunk.
         chunk_length: K of the policy.
         action_dim: A of the policy.
         slots: number of environment slots.
 
     Raises:
-        ConfigError: neither of the two.
+        ConfigError: none of the three.
     """
-    if execution == AGGREGATE:
-        return TemporalAggregation(chunk_length, action_dim, slots=slots)
+    if execution in (AGGREGATE, AGGREGATE_VARIANCE):
+        return TemporalAggregation(chunk_length, action_dim, slots=slots, by_variance=execution == AGGREGATE_VARIANCE)
     text = str(execution).strip()
     if not text.isdigit() or not 1 <= int(text) <= chunk_length:
-        expected = f"`{AGGREGATE}` or a number of steps from 1 to {chunk_length}"
+        expected = f"`{AGGREGATE}`, `{AGGREGATE_VARIANCE}` or a number of steps from 1 to {chunk_length}"
         raise ConfigError("execution", expected, execution, "Say how the chunks are to be executed.")
     return ChunkExecution(int(text), slots)

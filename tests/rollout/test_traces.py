@@ -1,0 +1,41 @@
+import numpy as np
+import pytest
+from fake_policy import Reacher
+from fake_simulator import FakeSimulator
+
+from ugr_lightning.errors import DataError
+from ugr_lightning.rollout.runner import run_episodes
+from ugr_lightning.rollout.traces import read_traces, write_trace
+
+
+@pytest.fixture
+def written(tmp_path):
+    """Results of two episodes of a policy and one of a dummy, and the folder of their traces."""
+    options = {"simulator": FakeSimulator, "image_size": (4, 6), "progress": False, "workers": 1}
+    keep = {"on_result": lambda result, trace: write_trace(tmp_path, result, trace), "execution": "2"}
+    results = run_episodes(Reacher(), "reach", [5, 4], **options, **keep)
+    run_episodes("zero", "reach", [4], **options, on_result=keep["on_result"])
+    return results, tmp_path
+
+
+def test_a_trace_says_when_the_policy_was_asked_and_what_it_answered(written):
+    results, folder = written
+    traces = read_traces(folder.glob("*.npz"))
+    assert [trace.seed for trace in traces] == [4, 5]  # none of the dummy
+    for trace, result in zip(traces, reversed(results), strict=True):
+        assert (trace.steps, trace.success) == (result.steps, result.success)
+        assert trace.query.tolist() == list(range(0, result.steps, 2))
+        assert trace.log_variance.shape == (len(trace.query), 5)
+        assert trace.log_variance[0].tolist() == [-1, -2, -3, -4, -5]
+        assert trace.contacts.shape == (trace.steps + 1, 2)
+
+
+def test_a_damaged_trace_is_named(written):
+    _, folder = written
+    path = sorted(folder.glob("*.npz"))[0]
+    path.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(DataError, match=path.name):
+        read_traces([path])
+    np.savez(path, seed=1)
+    with pytest.raises(DataError, match=path.name):
+        read_traces([path])
