@@ -84,7 +84,7 @@ def test_cochran_mantel_haenszel_agrees_with_statsmodels():
 
 
 def test_cochran_mantel_haenszel_of_the_papers_table():
-    """UGR against ACT, 100 episodes of each of five tasks: R's mantelhaen.test(correct = FALSE) has the same formula."""
+    """UGR against ACT, 100 episodes of each of five tasks, with the formula written out."""
     ours = cochran_mantel_haenszel(
         [(50, 100, 45, 100), (27, 100, 20, 100), (21, 100, 15, 100), (78, 100, 65, 100), (41, 100, 29, 100)],
         correction=False,

@@ -60,20 +60,25 @@ def _is_close(contest: Contest) -> bool:
 
 def _verdict(contest: Contest) -> str:
     if _differs(contest):
-        better, worse = (contest.a, contest.b) if contest.difference > 0 else (contest.b, contest.a)
-        return (
-            f"`{better}` succeeds more often than `{worse}` {_where(contest)}: {_numbers(contest)}. {_again(contest)}"
-        )
+        better, worse = _ordered(contest)
+        found = f"`{better}` succeeds more often than `{worse}` {_where(contest)}"
+        return f"{found}: {_numbers(contest)}. {_again(contest)}"
     if _is_close(contest):
         largest = max(-contest.low, contest.high)
         return (
-            f"`{contest.a}` and `{contest.b}` differ by less than {largest:.0%} {_where(contest)}, and no difference is "
-            f"shown: {_numbers(contest)}."
+            f"`{contest.a}` and `{contest.b}` differ by less than {largest:.0%} {_where(contest)}, and no difference "
+            f"is shown: {_numbers(contest)}."
         )
     return (
         f"Whether `{contest.a}` or `{contest.b}` is better {_where(contest)}: {_numbers(contest)}; anything from "
-        f"{contest.low:+.0%} to {contest.high:+.0%} is compatible with these episodes, which are too few. {_needed(contest)}"
+        f"{contest.low:+.0%} to {contest.high:+.0%} is compatible with these episodes, which are too few."
+        f"{_needed(contest)}"
     )
+
+
+def _ordered(contest: Contest) -> tuple[str, str]:
+    """The more successful policy first."""
+    return (contest.a, contest.b) if contest.difference > 0 else (contest.b, contest.a)
 
 
 def _where(contest: Contest) -> str:
@@ -115,12 +120,10 @@ def _needed(contest: Contest) -> str:
     if size < 0.005 or differing < size - 1e-9:  # tasks of unequal size weigh the same in one and not in the other
         return ""
     try:
-        return (
-            f"A difference of the size seen takes about {paired_episodes(size, max(size, differing))} shared seeds to be found with "
-            "80 % power."
-        )
+        count = f"about {paired_episodes(size, max(size, differing))}"
     except ConfigError:
-        return f"A difference of the size seen takes more than {LARGEST} shared seeds."
+        count = f"more than {LARGEST}"
+    return f" A difference of the size seen takes {count} shared seeds to be found with 80 % power."
 
 
 def _single_tasks(contests: list[Contest]) -> list[str]:
@@ -128,10 +131,7 @@ def _single_tasks(contests: list[Contest]) -> list[str]:
     found = [c for c in contests if _differs(c)]
     if not found:
         return []
-    named = [
-        f"`{c.a if c.difference > 0 else c.b}` over `{c.b if c.difference > 0 else c.a}` {_where(c)} (p = {c.p_holm:.3g})"
-        for c in found
-    ]
+    named = ["`{}` over `{}` {} (p = {:.3g})".format(*_ordered(c), _where(c), c.p_holm) for c in found]
     return [f"By themselves these tasks show a difference between the checkpoints: {'; '.join(named)}."]
 
 

@@ -14,15 +14,16 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ugr_lightning.analysis.conclusions import conclude, described_execution
-from ugr_lightning.analysis.report import ALL_TASKS, Contest, Mode, Rate, Report
+from ugr_lightning.analysis.report import ALL_TASKS, Contest, Rate, Report
 from ugr_lightning.data.folder import publish
 
 METHOD = (
-    "Rates carry n and the 95 % Wilson interval over all episodes. Policies are compared on the seeds and training seeds "
-    "that both have, with the exact McNemar test; where there are several training seeds or tasks, with its generalisation "
-    "in which every evaluation seed counts once (signs of the summed differences are flipped). p-values are corrected by "
-    "Holm's method within each execution mode, single tasks and all tasks apart. Intervals of differences are Newcombe's "
-    "for one task and one training seed, otherwise from a hierarchical bootstrap over training seeds and evaluation seeds."
+    "Rates carry n and the 95 % Wilson interval over all episodes. Policies are compared on the seeds and training "
+    "seeds that both have, with the exact McNemar test; where there are several training seeds or tasks, with its "
+    "generalisation in which every evaluation seed counts once (signs of the summed differences are flipped). p-values "
+    "are corrected by Holm's method within each execution mode, single tasks and all tasks apart. Intervals of "
+    "differences are Newcombe's for one task and one training seed, otherwise from a hierarchical bootstrap over "
+    "training seeds and evaluation seeds."
 )
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}"

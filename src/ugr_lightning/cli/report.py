@@ -76,11 +76,12 @@ def _plan(power: list[float], discordance: float | None) -> int:
             "the worse one never wins": abs(a - b),
         }
     )
-    print(f"Episodes of each policy to tell {a:.1%} from {b:.1%}: two-sided level 5 %, power 80 %\n")
-    print(f"{'each on seeds of its own':<52}{plan(a, b, discordance=discordance).unpaired:>8}")
+    rows = [("each on seeds of its own", plan(a, b, discordance=discordance).unpaired)]
     for name, share in shares.items():
-        needed = plan(a, b, discordance=share).paired
-        print(f"{f'shared seeds, {share:.1%} of them differ ({name})':<52}{needed:>8}")
+        rows.append((f"shared seeds, {share:.1%} of them differ ({name})", plan(a, b, discordance=share).paired))
+    width = max(len(row[0]) for row in rows)
+    print(f"Episodes of each policy to tell {a:.1%} from {b:.1%}: two-sided level 5 %, power 80 %\n")
+    print("\n".join(f"{what:<{width}}{count:>8}" for what, count in rows))
     return 0
 
 
