@@ -78,6 +78,28 @@ def test_measured_joints_can_be_the_state(episodes, store):
     np.testing.assert_array_equal(batch.state[0], episodes[0].measured[4])
 
 
+def test_several_observations_are_those_just_before_oldest_first(episodes, store):
+    batch = ChunkDataset(episodes, store, K, observation_steps=3).__getitems__([7 + 4, 17 + 12])
+    assert batch.images.shape == (2, 3, 3, 3, 24, 32)
+    assert batch.state.shape == (2, 3, 14)
+    assert batch.images.movedim(-3, -1).is_contiguous()
+    for row, (episode, step) in enumerate(((1, 4), (2, 12))):
+        np.testing.assert_array_equal(batch.state[row], episodes[episode].state[step - 2 : step + 1])
+        for past in range(3):
+            expected = episodes[episode].images(step - 2 + past)
+            np.testing.assert_array_equal(batch.images[row, past].permute(0, 2, 3, 1), expected)
+        np.testing.assert_array_equal(batch.actions[row, 0], episodes[episode].action[step])
+
+
+def test_observations_before_the_start_repeat_the_first_of_the_same_episode(episodes, store):
+    batch = ChunkDataset(episodes, store, K, observation_steps=3).__getitems__([7, 8])  # steps 0 and 1 of episode 1
+    state = episodes[1].state
+    np.testing.assert_array_equal(batch.state[0], state[[0, 0, 0]])
+    np.testing.assert_array_equal(batch.state[1], state[[0, 0, 1]])
+    assert torch.equal(batch.images[0, 0], batch.images[1, 0])
+    assert not torch.equal(batch.images[1, 0], batch.images[1, 2])
+
+
 def test_one_index_gives_a_batch_of_one(episodes, store):
     data = ChunkDataset(episodes, store, K)
     one, many = data[8], data[[8, 9]]
@@ -86,7 +108,14 @@ def test_one_index_gives_a_batch_of_one(episodes, store):
 
 
 @pytest.mark.parametrize(
-    "options", [{"chunk_length": 0}, {"action_offset": 1}, {"after_end": "pad"}, {"state": "desired"}]
+    "options",
+    [
+        {"chunk_length": 0},
+        {"action_offset": 1},
+        {"after_end": "pad"},
+        {"state": "desired"},
+        {"observation_steps": 0},
+    ],
 )
 def test_impossible_options_are_refused(options, episodes, store):
     with pytest.raises(ConfigError, match=next(iter(options))):

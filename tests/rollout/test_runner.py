@@ -103,6 +103,35 @@ def test_a_policy_sees_the_joints_it_was_trained_on(runner, state):
     assert not np.array_equal(frames[-1].commanded, frames[-1].measured)
 
 
+class Remembering(Reacher):
+    """Acts on the newest of its observations and keeps all states and one pixel of each picture."""
+
+    def predict(self, observation):
+        images, state = observation
+        self.pixels = [
+            *getattr(self, "pixels", []),
+            images[:, :, 0, 0, -1, -1].clone(),
+        ]  # (B, T): the fake counts steps there
+        self.histories = [*getattr(self, "histories", []), state.clone()]  # (B, T, S)
+        return super().predict(type(observation)(images[:, -1], state[:, -1]))
+
+
+def test_a_policy_of_several_observations_sees_the_steps_just_before_also_those_without_a_query():
+    policy, traces = Remembering(chunk_length=6), []
+    policy.observation_steps = 3
+    keep = {"on_result": lambda result, trace: traces.append(trace)}
+    results = run(policy, seeds=[5, 6], workers=1, slots_per_worker=1, execution=4, **keep)
+    seen = iter(zip(policy.histories, policy.pixels, strict=True))
+    for result, trace in zip(results, traces, strict=True):
+        for step in range(0, result.steps, 4):
+            past = [max(0, step - 2), max(0, step - 1), step]  # before the start: the first, never the last episode
+            history, pixels = next(seen)
+            assert np.array_equal(history[0].numpy(), np.stack([trace.frames[i].commanded for i in past]))
+            assert pixels[0].tolist() == past
+    assert next(seen, None) is None
+    assert len(policy.histories) > 3
+
+
 def test_chunks_are_queried_only_when_used_up(runner):
     policy = Reacher()
     results = runner.run(policy, [0], execution=5, progress=False)

@@ -2,10 +2,13 @@ import csv
 
 import pytest
 import torch
+from lightning.pytorch import Trainer
 from tiny import TinyData, TinyPolicy, TinySamples, collate, train
 
 from ugr_lightning.errors import NumericsError
 from ugr_lightning.training.module import PolicyModule
+
+QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
 
 
 @pytest.fixture(scope="module")
@@ -63,6 +66,15 @@ def test_a_nan_loss_stops_training_and_leaves_what_is_needed_to_replay_it(tmp_pa
     assert dump["batch"]["state"].shape[1] == 3
     assert str(int(dump["batch"]["episode"][0])) + ":" in str(caught.value)
     assert (folder / "last.ckpt").is_file(), "the checkpoint of the first epoch is still there"
+
+
+def test_the_optimiser_takes_its_settings(tmp_path):
+    given = {"learning_rate": 2e-4, "weight_decay": 1e-6, "betas": (0.95, 0.99)}
+    module = PolicyModule(TinyPolicy(), **given)
+    trainer = Trainer(accelerator="cpu", max_steps=1, default_root_dir=tmp_path, logger=False, **QUIET)
+    trainer.fit(module, datamodule=TinyData())
+    (group,) = trainer.optimizers[0].param_groups
+    assert (group["lr"], group["weight_decay"], group["betas"]) == (2e-4, 1e-6, (0.95, 0.99))
 
 
 def test_schedule_warms_up_and_ends_at_a_hundredth():

@@ -94,10 +94,10 @@ class ConditionalUNet(nn.Module):
 
         levels = list(pairwise((channels, *widths)))
         self.down = nn.ModuleList(pair(*level) for level in levels)
-        self.halve = nn.ModuleList(nn.Conv1d(width, width, 3, 2, 1) for width in widths[:-1])
+        self.downsample = nn.ModuleList(nn.Conv1d(width, width, 3, 2, 1) for width in widths[:-1])
         self.middle = pair(widths[-1], widths[-1])
         self.up = nn.ModuleList(pair(2 * outputs, inputs) for inputs, outputs in reversed(levels[1:]))
-        self.double = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, 2, 1) for width in reversed(widths[:-1]))
+        self.upsample = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, 2, 1) for width in reversed(widths[:-1]))
         self.last = ConvBlock(widths[0], widths[0], kernel, groups)
         self.head = nn.Conv1d(widths[0], channels, 1)
 
@@ -120,13 +120,13 @@ class ConditionalUNet(nn.Module):
         for level, (first, second) in enumerate(self.down):
             x = second(first(x, condition), condition)  # (B, width, L' / 2^level)
             skipped.append(x)
-            if level < len(self.halve):
-                x = self.halve[level](x)
+            if level < len(self.downsample):
+                x = self.downsample[level](x)
         for block in self.middle:
             x = block(x, condition)
-        for (first, second), double in zip(self.up, self.double, strict=True):
+        for (first, second), upsample in zip(self.up, self.upsample, strict=True):
             x = torch.cat([x, skipped.pop()], dim=1)  # (B, 2 width, L' / 2^level)
-            x = double(second(first(x, condition), condition))
+            x = upsample(second(first(x, condition), condition))
         x = self.last(x)[..., :length]  # (B, width, L); the first level has no skip, as in the public code
         with torch.autocast(x.device.type, enabled=False):
             return self.head(x.float()).transpose(1, 2)

@@ -35,6 +35,25 @@ def test_the_average_is_what_is_validated_and_saved(tmp_path):
     assert torch.equal(saved["state_dict"]["policy.mean"], torch.full((3,), 0.25)), "statistics do not drift"
 
 
+def test_with_a_power_the_average_spans_more_steps_the_longer_training_lasts():
+    average = WeightAverage(0.9999, power=0.75)
+    assert average.decay_at(1) == 1 - 2**-0.75
+    assert average.decay_at(30_000) < average.decay_at(300_000) == 0.9999
+    assert WeightAverage(0.99).decay_at(1) == 2 / 11
+    assert WeightAverage(0.99).decay_at(2000) == 0.99
+
+
+def test_the_power_decides_what_is_saved(tmp_path, monkeypatch):
+    monkeypatch.setattr("tiny.WeightAverage", lambda decay: WeightAverage(decay, power=0.75))
+    watch, policy = Watch(), TinyPolicy()
+    average = policy.head.weight.detach().clone()
+    train(tmp_path / "tiny" / "version_0", policy, [watch], max_steps=3)
+    for step, weight in enumerate(watch.steps, start=1):
+        average.lerp_(weight, (1 + step) ** -0.75)
+    saved = torch.load(tmp_path / "tiny" / "version_0" / "last.ckpt", weights_only=True)
+    assert torch.allclose(saved["state_dict"]["policy.head.weight"], average, atol=1e-6)
+
+
 def test_buffers_of_batch_normalisation_are_averaged_too(tmp_path):
     folder = tmp_path / "tiny" / "version_0"
     train(folder, max_steps=5)
