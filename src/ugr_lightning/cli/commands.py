@@ -1,4 +1,4 @@
-"""`ugr collect`, `ugr tasks`, `ugr doctor` and `ugr bench`."""
+"""`ugr collect`, `ugr doctor` and `ugr bench`."""
 
 import sys
 from collections.abc import Callable, Sequence
@@ -22,8 +22,8 @@ def _collect(
     """Record demonstrations of a task's scripted expert in RoboTwin 2.0's layout; goes on where it was stopped.
 
     Args:
-        task: a name from `ugr tasks`.
-        episodes: how many the folder shall hold.
+        task: a name from `ugr tasks`, or `all` for one after another.
+        episodes: how many each folder shall hold.
         root: where to; episodes are in `<root>/<task>/<setting>/data`.
         setting: `demo_clean` or `demo_randomized`.
         image_size: height and width of the pictures.
@@ -32,28 +32,23 @@ def _collect(
         video: write a video of each episode as well.
     """
     from ugr_lightning.rollout.collect import collect as record
+    from ugr_lightning.sim.settings import check_setting
+    from ugr_lightning.sim.tasks import named_tasks
 
-    folder = Path(root) / task / setting
-    record(
-        task,
-        folder,
-        episodes=episodes,
-        setting=setting,
-        image_size=image_size,
-        noise=noise,
-        workers=workers,
-        video=video,
-    )
-    print(f"{episodes} demonstrations in {folder}")
-    return 0
-
-
-def _tasks() -> int:
-    """List the simulated tasks."""
-    from ugr_lightning.sim.tasks import task_summaries
-
-    for name, summary in task_summaries().items():
-        print(f"{name:<20}{summary}")
+    check_setting(setting)
+    for name in named_tasks(task):
+        folder = Path(root) / name / setting
+        record(
+            name,
+            folder,
+            episodes=episodes,
+            setting=setting,
+            image_size=image_size,
+            noise=noise,
+            workers=workers,
+            video=video,
+        )
+        print(f"{episodes} demonstrations in {folder}", flush=True)
     return 0
 
 
@@ -98,7 +93,6 @@ def _bench(
 
 FUNCTIONS: dict[str, Callable[..., int]] = {
     "collect": _collect,
-    "tasks": _tasks,
     "doctor": _doctor,
     "bench": _bench,
 }

@@ -10,15 +10,19 @@ from ugr_lightning.errors import UGRError
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("ugr_lightning.cli.demo:run", "the whole loop in minutes: record, train, evaluate, show a table"),
     "doctor": ("ugr_lightning.cli.commands:run", "check this machine and say what to do"),
-    "tasks": ("ugr_lightning.cli.commands:run", "list the simulated tasks"),
+    "tasks": ("ugr_lightning.cli.tasks:run", "list the simulated tasks; measure, verify and picture them"),
     "collect": ("ugr_lightning.cli.commands:run", "record demonstrations of a task's scripted expert"),
     "fit": ("ugr_lightning.cli.fit:run", "train a policy; records missing demonstrations first"),
     "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
     "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
     "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
     "analyze": ("ugr_lightning.cli.analyze:run", "whether a checkpoint's uncertainty knows the error"),
-    "benchmark": ("ugr_lightning.cli.benchmark:run", "policies, tasks and training seeds of one yaml: record, train, evaluate"),
+    "benchmark": (
+        "ugr_lightning.cli.benchmark:run",
+        "policies, tasks and training seeds of one yaml: record, train, evaluate",
+    ),
     "report": ("ugr_lightning.cli.report:run", "compare policies: intervals, paired tests, what may be concluded"),
+    "replay": ("ugr_lightning.cli.replay:run", "execute recorded commands again and confirm the outcome"),
     "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
     "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }

@@ -8,7 +8,7 @@ import json
 from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
@@ -32,6 +32,15 @@ FORMAT_VERSION = 1
 MAX_PIXELS = 4096
 DISK_CAMERAS = {"cam_high": "head_camera", "cam_right_wrist": "right_camera", "cam_left_wrist": "left_camera"}
 CAMERA_PARAMETERS = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
+
+_ATTRIBUTES: dict[str, type] = {
+    "seed": int,
+    "control_hz": float,
+    "task": str,
+    "task_version": int,
+    "setting": str,
+    "noise": str,
+}
 
 CameraParameters = Mapping[str, Mapping[str, np.ndarray]]
 
@@ -234,6 +243,46 @@ def read_episode(path: Path, cameras: Sequence[str] = CAMERAS, *, seed: int | No
     )
 
 
+class Executed(NamedTuple):
+    """What a robot was told and did in a recorded episode of N steps.
+
+    Args:
+        path: the file.
+        task, setting, seed: which episode.
+        task_version: None in files that do not say.
+        actions: (N, 14) float32, the commands that were executed, noise included.
+        measured: (N + 1, 14) float32, the joints at reset and after every step.
+    """
+
+    path: Path
+    task: str
+    setting: str
+    seed: int
+    task_version: int | None
+    actions: np.ndarray
+    measured: np.ndarray
+
+
+def read_executed(path: Path) -> Executed:
+    """Read what it takes to execute a recording again.
+
+    Raises:
+        DataError: the file is damaged, or does not say its task, setting and seed, as RoboTwin's own do not.
+    """
+    path = Path(path)
+    with open_hdf5(path) as file:
+        vector = read_array(file, "joint_action/vector", (None, STATE_DIM))
+        about = _read_extras(file, len(vector))
+        missing = [name for name in ("task", "setting", "seed") if name not in about]
+        if missing or not has_key(file, "ugr/measured"):
+            got = f"no {', '.join(missing) or 'measured joints'}"
+            fix = "Only recordings of `ugr collect` can be replayed."
+            raise DataError(path, "a recording that names its task, setting and seed", got, fix)
+        measured = read_array(file, "ugr/measured", (len(vector), STATE_DIM))
+    version_of_task = about.get("task_version")
+    return Executed(path, about["task"], about["setting"], about["seed"], version_of_task, vector[1:], measured)
+
+
 def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
     """Check every frame of a camera by its header and end marker; return their common (height, width)."""
     found, where = find_dataset(file, key), f"{file.filename}:{key}"
@@ -267,9 +316,7 @@ def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
     if written not in (None, FORMAT_VERSION):
         got = f"version {written}"
         raise DataError(file.filename, f"format version {FORMAT_VERSION}", got, "Update ugr-lightning.")
-    kinds: dict[str, type] = {"seed": int, "control_hz": float, "task": str, "setting": str, "noise": str}
-    kinds["task_version"] = int
-    for name, kind in kinds.items():
+    for name, kind in _ATTRIBUTES.items():
         value = read_attribute(file, name)
         if value is None:
             continue

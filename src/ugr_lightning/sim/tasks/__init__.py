@@ -52,6 +52,18 @@ def check_task(name: str) -> None:
         raise ConfigError("task", "one of " + ", ".join(names), repr(name), fix)
 
 
+def named_tasks(which: str) -> tuple[str, ...]:
+    """The tasks that `all` or a name stands for.
+
+    Raises:
+        ConfigError: neither.
+    """
+    if which == "all":
+        return task_names()
+    check_task(which)
+    return (which,)
+
+
 def environment_id(name: str) -> str:
     """The task's gymnasium id, e.g. `UGR-ClickAlarmclock-v1`."""
     return f"UGR-{''.join(part.capitalize() for part in name.split('_'))}-v1"
