@@ -16,8 +16,8 @@ TOLERANCE = 0.02  # in x and in y
 RAISED = 0.12  # the mug's origin above the table
 OPEN = 0.8
 
-# Randomisation. FACTS 9 has the rack at x 0.1 .. 0.3, where the ViperX has no room between its base and the peg, and the
-# mug turned by +-1.57, where the hand on its way to the middle would have to turn the handle by a quarter.
+# Randomisation. FACTS 9 has the rack at x 0.1 .. 0.3, where the peg would meet the hand of the resting right arm, and
+# the mug turned by up to +-1.57, where it hides its handle from the high camera.
 MUG_X, MUG_Y = (-0.25, -0.1), (-0.05, 0.05)
 MUG_YAW = (-0.8, 0.8)  # of the handle, from pointing at the left arm
 RACK_X, RACK_Y, RACK_YAW = (0.0, 0.1), (0.15, 0.19), (-0.2, 0.2)
@@ -31,14 +31,14 @@ PEG_RADIUS, PEG_LENGTH, PEG_TILT, PEG_HEIGHT = 0.004, 0.14, 0.25, 0.27
 
 MEETING_POINT = np.array([0.0, -0.12, 0.0])
 GRASP = 0.6  # fraction of the mug's height
-BEYOND = 0.045  # how far in front of the peg the handle waits
+BEYOND = 0.06  # how far in front of the peg the handle waits
 REST = 0.002  # commanded below the height at which the handle touches the peg
 
 
 class HangingMug(TwoArmEnv):
     """Left grasps across the handle and sets the mug down; right takes it, tips it over and slides it onto the peg."""
 
-    horizon = 520
+    horizon = 530
     version = 1
 
     def build(self, rng: np.random.Generator) -> None:
@@ -73,7 +73,7 @@ class HangingMug(TwoArmEnv):
             mug.box((WALL, width, h - FLOOR), (x, y, (h + FLOOR) / 2.0), None, rotation=turned)
         height = self.opening_middle[2]
         arc = np.linspace(-np.pi / 2.0, np.pi / 2.0, 11)
-        x, z = r - 0.003 + (self.reach + 0.003 - TUBE) * np.cos(arc), height + (height - TUBE - 0.005) * np.sin(arc)
+        x, z = r + (self.reach - TUBE) * np.cos(arc), height + (height - TUBE - 0.005) * np.sin(arc)
         points = np.stack([x, np.zeros_like(x), z], axis=1)  # (11, 3)
         for start, end in zip(points[:-1], points[1:], strict=True):
             mug.capsule(start, end, TUBE, colour)
@@ -149,9 +149,9 @@ class HangingMug(TwoArmEnv):
 
     def _hang(self, arms: Arms) -> Iterator[ExpertStep]:
         before = self._hanging(PEG_LENGTH + BEYOND)
-        yield from arms.move({"right": before}, steps=46, phase="tip", slack=(1.0, 1.0, 0.4), overlap=6)
+        yield from arms.move({"right": before}, steps=46, phase="tip", slack=(1.0, 0.8, 0.4, 0.2), overlap=6)
         yield from arms.move(
-            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.4, 0.1, 0.1)
+            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.2, 0.15, 0.1)
         )
         drop = (self.reach - 2 * TUBE) / 2.0 - PEG_RADIUS + REST
         yield from arms.move({"right": self._hanging(PEG_LENGTH / 2.0, drop)}, steps=12, phase="rest", slack=(0.1, 0.0))
