@@ -68,7 +68,7 @@ def test_processes_that_start_together_share_one_complete_cache(tmp_path, monkey
 
 def test_another_version_of_the_conversion_has_another_cache_entry(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    monkeypatch.setattr(urdf, "_convert", lambda assets, folder: folder.mkdir(parents=True))
+    monkeypatch.setattr(urdf, "_convert", lambda assets, folder: (folder / "dual_vx300s.urdf").touch())
     first = urdf.dual_arm_urdf()
     monkeypatch.setattr(urdf, "VERSION", urdf.VERSION + 1)
     assert urdf.dual_arm_urdf() != first

@@ -8,12 +8,13 @@ import sys
 from typing import NamedTuple
 
 from ugr_lightning.errors import RenderError
+from ugr_lightning.sim.shaders import plain_shaders
 
 _PROGRAM = """
 import json, sys
 import sapien, sapien.render
 sapien.render.set_log_level("error")
-sapien.render.set_camera_shader_dir("minimal")
+sapien.render.set_camera_shader_dir(sys.argv[2])
 sapien.render.set_picture_format("Color", "r8g8b8a8unorm")
 device = sapien.Device(sys.argv[1])
 scene = sapien.Scene([sapien.physx.PhysxCpuSystem(), sapien.render.RenderSystem(device)])
@@ -64,7 +65,7 @@ def probe_rendering(timeout_s: float = 60) -> RenderProbe:
     Args:
         timeout_s: seconds after which the driver counts as hanging.
     """
-    command = [sys.executable, "-c", _PROGRAM, render_device()]
+    command = [sys.executable, "-c", _PROGRAM, render_device(), str(plain_shaders() or "minimal")]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
     except subprocess.TimeoutExpired:

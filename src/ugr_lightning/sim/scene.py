@@ -18,6 +18,7 @@ from ugr_lightning.sim.objects import pose_of
 from ugr_lightning.sim.robot import ACTION_HIGH, ACTION_LOW, HOME_ACTION, UID
 from ugr_lightning.sim.room import furnish, illuminate
 from ugr_lightning.sim.settings import Point, Surroundings, check_setting, surroundings_of
+from ugr_lightning.sim.shaders import camera_shader
 
 SIMULATION_HZ, CONTROL_HZ = 250, 25
 SETTLE_SECONDS = 0.1  # inside reset, never recorded
@@ -132,15 +133,18 @@ class TwoArmEnv(BaseEnv):
             "cam_right_wrist": (wrist, 70.0, links["right_gripper_link"]),
             "cam_left_wrist": (wrist, 70.0, links["left_gripper_link"]),
         }
+        shader = camera_shader()
         return [
-            CameraConfig(name, pose, width, height, np.deg2rad(fov), near=0.01, far=5.0, mount=mount)
+            CameraConfig(name, pose, width, height, np.deg2rad(fov), 0.01, 5.0, mount=mount, shader_config=shader)
             for name, (pose, fov, mount) in ((name, cameras[name]) for name in CAMERAS)
         ]
 
     @property
     def _default_human_render_camera_configs(self) -> CameraConfig:
         pose = look_at((0.0, -0.75, 0.65), (0.0, 0.0, 0.05))
-        return CameraConfig("render_camera", pose, 512, 384, np.deg2rad(55), near=0.01, far=5.0)
+        # picture formats are global in SAPIEN: with other shaders for the sensors, ManiSkill's own sets them again
+        shader = None if self._custom_sensor_configs else camera_shader()
+        return CameraConfig("render_camera", pose, 512, 384, np.deg2rad(55), 0.01, 5.0, shader_config=shader)
 
     def reset(self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None) -> Any:
         """Build a new episode; see `BaseEnv.reset`."""

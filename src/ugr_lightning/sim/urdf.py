@@ -5,9 +5,6 @@ Only the package's files are read; it is never imported, because it would want M
 
 import hashlib
 import importlib.util
-import os
-import shutil
-import tempfile
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
@@ -16,6 +13,7 @@ import numpy as np
 import trimesh
 
 from ugr_lightning.errors import SimulationError
+from ugr_lightning.sim.cache import cached_folder
 from ugr_lightning.sim.kinematics import (
     BASE_X,
     SIDES,
@@ -40,8 +38,7 @@ _BOX_FACES, _SCREW_SIZE = 12, 8.0  # fewer faces are stray triangles; mm
 def dual_arm_urdf() -> Path:
     """Path of the URDF of both arms, converted on first use.
 
-    The result lies in the user's cache folder under a key made of the inputs and of `VERSION`. It is written aside and
-    renamed as a whole, so that processes that start together do not see half of it.
+    The result lies in the user's cache folder under a key made of the inputs and of `VERSION`.
 
     Raises:
         SimulationError: `gym-aloha` is not installed or lacks a file.
@@ -54,9 +51,7 @@ def dual_arm_urdf() -> Path:
     digest = hashlib.sha256(str(VERSION).encode())
     for file in files:
         digest.update(file.name.encode() + file.read_bytes())
-    folder = _cache_folder() / f"dual_vx300s-{digest.hexdigest()[:16]}"
-    if not folder.is_dir():
-        _convert(assets, folder)
+    folder = cached_folder(f"dual_vx300s-{digest.hexdigest()[:16]}", lambda empty: _convert(assets, empty))
     return folder / "dual_vx300s.urdf"
 
 
@@ -70,32 +65,19 @@ def _assets_folder() -> Path:
     return Path(next(iter(found.submodule_search_locations))) / "assets"
 
 
-def _cache_folder() -> Path:
-    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ugr-lightning"
-
-
 def _convert(assets: Path, folder: Path) -> None:
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    aside = Path(tempfile.mkdtemp(prefix=folder.name + ".", suffix=".partial", dir=folder.parent))
-    try:
-        dependencies = ElementTree.parse(assets / "vx300s_dependencies.xml")
-        meshes = {mesh.attrib["name"]: mesh.attrib["file"] for mesh in dependencies.iter("mesh")}
-        _write_meshes(assets, sorted(set(meshes.values())), aside)
-        robot = ElementTree.Element("robot", name="dual_vx300s")
-        ElementTree.SubElement(robot, "link", name="root")
-        for side in SIDES:
-            body = ElementTree.parse(assets / f"vx300s_{side}.xml").getroot().find("body")
-            if body is None:
-                raise SimulationError(assets / f"vx300s_{side}.xml", "a body element", "none", _REINSTALL)
-            _add_arm(robot, side, body, meshes)
-        ElementTree.indent(robot)
-        ElementTree.ElementTree(robot).write(aside / "dual_vx300s.urdf")
-        os.replace(aside, folder)
-    except OSError:
-        if not folder.is_dir():  # otherwise another process was first, with the same content
-            raise
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
+    dependencies = ElementTree.parse(assets / "vx300s_dependencies.xml")
+    meshes = {mesh.attrib["name"]: mesh.attrib["file"] for mesh in dependencies.iter("mesh")}
+    _write_meshes(assets, sorted(set(meshes.values())), folder)
+    robot = ElementTree.Element("robot", name="dual_vx300s")
+    ElementTree.SubElement(robot, "link", name="root")
+    for side in SIDES:
+        body = ElementTree.parse(assets / f"vx300s_{side}.xml").getroot().find("body")
+        if body is None:
+            raise SimulationError(assets / f"vx300s_{side}.xml", "a body element", "none", _REINSTALL)
+        _add_arm(robot, side, body, meshes)
+    ElementTree.indent(robot)
+    ElementTree.ElementTree(robot).write(folder / "dual_vx300s.urdf")
 
 
 # -------------------------------------------------------------------------------------------------------- meshes
