@@ -46,7 +46,22 @@ class ResidualBlock(nn.Module):
     def forward(self, x: Tensor, condition: Tensor) -> Tensor:
         """(B, inputs, L) and an activated condition (B, C) to (B, outputs, L)."""
         scale, shift = self.film(condition)[..., None].chunk(2, dim=1)  # (B, outputs, 1) each
-        return self.second(scale * self.first(x) + shift) + self.shortcut(x)
+        y: Tensor = self.second(scale * self.first(x) + shift) + self.shortcut(x)
+        return y
+
+
+class Level(nn.Module):
+    """Two residual blocks, the first of which may change the number of channels; arguments as theirs."""
+
+    def __init__(self, inputs: int, outputs: int, condition: int, kernel: int, groups: int) -> None:
+        super().__init__()
+        self.first = ResidualBlock(inputs, outputs, condition, kernel, groups)
+        self.second = ResidualBlock(outputs, outputs, condition, kernel, groups)
+
+    def forward(self, x: Tensor, condition: Tensor) -> Tensor:
+        """(B, inputs, L) and an activated condition (B, C) to (B, outputs, L)."""
+        y: Tensor = self.second(self.first(x, condition), condition)
+        return y
 
 
 class ConditionalUNet(nn.Module):
@@ -86,17 +101,11 @@ class ConditionalUNet(nn.Module):
             raise ConfigError("step_dim", "an even number from 4", step_dim, "Change it.")
         self.step_dim, self.multiple = step_dim, 2 ** (len(widths) - 1)
         self.step_embed = nn.Sequential(nn.Linear(step_dim, 4 * step_dim), nn.Mish(), nn.Linear(4 * step_dim, step_dim))
-        condition += step_dim
-
-        def pair(inputs: int, outputs: int) -> nn.ModuleList:
-            sizes = (condition, kernel, groups)
-            return nn.ModuleList([ResidualBlock(inputs, outputs, *sizes), ResidualBlock(outputs, outputs, *sizes)])
-
-        levels = list(pairwise((channels, *widths)))
-        self.down = nn.ModuleList(pair(*level) for level in levels)
+        levels, sizes = list(pairwise((channels, *widths))), (condition + step_dim, kernel, groups)
+        self.down = nn.ModuleList(Level(inputs, outputs, *sizes) for inputs, outputs in levels)
         self.downsample = nn.ModuleList(nn.Conv1d(width, width, 3, 2, 1) for width in widths[:-1])
-        self.middle = pair(widths[-1], widths[-1])
-        self.up = nn.ModuleList(pair(2 * outputs, inputs) for inputs, outputs in reversed(levels[1:]))
+        self.middle = Level(widths[-1], widths[-1], *sizes)
+        self.up = nn.ModuleList(Level(2 * outputs, inputs, *sizes) for inputs, outputs in reversed(levels[1:]))
         self.upsample = nn.ModuleList(nn.ConvTranspose1d(width, width, 4, 2, 1) for width in reversed(widths[:-1]))
         self.last = ConvBlock(widths[0], widths[0], kernel, groups)
         self.head = nn.Conv1d(widths[0], channels, 1)
@@ -117,19 +126,19 @@ class ConditionalUNet(nn.Module):
         embedded = self.step_embed(encode_step(step, self.step_dim))  # (B, step_dim)
         condition = functional.mish(torch.cat([embedded, condition.to(embedded.dtype)], dim=1))  # (B, step_dim + C)
         skipped = []
-        for level, (first, second) in enumerate(self.down):
-            x = second(first(x, condition), condition)  # (B, width, L' / 2^level)
+        for number, level in enumerate(self.down):
+            x = level(x, condition)  # (B, width, L' / 2^number)
             skipped.append(x)
-            if level < len(self.downsample):
-                x = self.downsample[level](x)
-        for block in self.middle:
-            x = block(x, condition)
-        for (first, second), upsample in zip(self.up, self.upsample, strict=True):
-            x = torch.cat([x, skipped.pop()], dim=1)  # (B, 2 width, L' / 2^level)
-            x = upsample(second(first(x, condition), condition))
+            if number < len(self.downsample):
+                x = self.downsample[number](x)
+        x = self.middle(x, condition)
+        for level, upsample in zip(self.up, self.upsample, strict=True):
+            x = torch.cat([x, skipped.pop()], dim=1)  # (B, 2 width, L' / 2^number)
+            x = upsample(level(x, condition))
         x = self.last(x)[..., :length]  # (B, width, L); the first level has no skip, as in the public code
         with torch.autocast(x.device.type, enabled=False):
-            return self.head(x.float()).transpose(1, 2)
+            predicted: Tensor = self.head(x.float()).transpose(1, 2)  # (B, L, A)
+        return predicted
 
 
 def encode_step(step: Tensor, size: int) -> Tensor:

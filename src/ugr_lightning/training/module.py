@@ -47,7 +47,7 @@ class PolicyModule(LightningModule):
         self.weight_decay = weight_decay
         self.warmup_steps = warmup_steps
         self.schedule = schedule
-        self.betas = tuple(betas)
+        self.betas = betas
         self.scores = nn.ModuleDict(_scores())
         self.last_chunk: Chunk | None = None  # of the validation batch at hand; the figures read it
 
