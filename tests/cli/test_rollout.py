@@ -20,7 +20,15 @@ def world(monkeypatch):
         results = []
         for seed in seeds:
             result = EpisodeResult(
-                task, "demo_clean", seed, "hash", actor.name, None, str(execution), seed % 2 == 0, 10
+                task,
+                "demo_clean",
+                seed,
+                options["seeds_hash"],
+                actor.name,
+                options["checkpoint"],
+                str(execution),
+                seed % 2 == 0,
+                10,
             )
             if video_dir and seed == seeds[0]:
                 result.video = str(Path(video_dir) / "a.gif")
@@ -86,3 +94,26 @@ def test_seed_lists_are_what_they_say():
 def test_a_typo_in_an_option_is_named(capsys):
     assert main(["rollout", "--polic", "zero"]) == 2
     assert "`policy`" in capsys.readouterr().err
+
+
+def test_a_test_that_goes_on_runs_only_the_missing_episodes(world, tiny_config, capsys):
+    out = Path("results.jsonl")
+    assert main(["fit", "--config", tiny_config]) == 0
+    assert main(["test", "--episodes", "3", "--executions", "[25]", "--out", str(out)]) == 0
+    assert (
+        main(["rollout", "--policy", "zero", "--task", "click_alarmclock", "--episodes", "9", "--out", str(out)]) == 0
+    )
+    with out.open("a") as file:
+        file.write('{"task": "click_al')  # a crash
+    world.clear()
+    assert main(["test", "--episodes", "5", "--out", str(out), "--resume", "--workers", "4"]) == 0
+    evaluation, _ = seed_list("evaluation", "click_alarmclock", 5)
+    assert [(call["execution"], call["seeds"], call["workers"]) for call in world] == [
+        ("aggregate", evaluation, 4),
+        (25, evaluation[3:], 4),
+    ], "as many workers as without interruption: the size of the policy's batch is part of its arithmetic"
+    world.clear()
+    capsys.readouterr()
+    assert main(["test", "--episodes", "5", "--out", str(out), "--resume"]) == 0
+    assert world == []
+    assert "/5" in capsys.readouterr().out

@@ -87,8 +87,9 @@ def _where(contest: Contest) -> str:
 
 
 def described_execution(execution: str) -> str:
-    """`aggregate` or a number of steps in words."""
-    return "aggregated chunks" if execution == "aggregate" else f"{execution} steps of each chunk"
+    """An execution in words; a name that a benchmark has given stays as it is."""
+    known = {"aggregate": "aggregated chunks", "aggregate-variance": "chunks aggregated by their variance"}
+    return known.get(execution, f"{execution} steps of each chunk" if execution.isdecimal() else execution)
 
 
 def _numbers(contest: Contest) -> str:

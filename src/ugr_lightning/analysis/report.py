@@ -22,7 +22,8 @@ class Mode(NamedTuple):
 
     Args:
         setting: scene setting.
-        execution: `aggregate`, or the number of steps executed of each chunk.
+        execution: `aggregate`, or the number of steps executed of each chunk, or the name that a benchmark gives to
+            executions that differ between policies.
     """
 
     setting: str
@@ -172,7 +173,7 @@ def _sort(evaluations: Sequence[Evaluation]) -> dict[tuple[Mode, str], dict[str,
         seed = evaluation.training_seed
         assert seed is not None
         for item in evaluation.results:
-            mode = Mode(item.setting, item.execution)
+            mode = Mode(item.setting, evaluation.modes.get(item.execution, item.execution))
             owner = owners.setdefault((mode, item.task, evaluation.policy, seed), evaluation)
             if owner is not evaluation:
                 what = f"{evaluation.policy}, {item.task}, training seed {seed}"

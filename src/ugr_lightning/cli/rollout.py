@@ -81,8 +81,9 @@ def roll_out(
     out: Path | None = None,
     traces: Path | None = None,
     refine_ratio: float | None = None,
+    resume: bool = False,
 ) -> list[EpisodeResult]:
-    """Roll out a dummy or a checkpoint; see `ugr rollout`.
+    """Roll out a dummy or a checkpoint; see `ugr rollout`. With `resume`, only the seeds that `out` lacks.
 
     Raises:
         ConfigError: no task is given and the policy does not name one.
@@ -127,6 +128,12 @@ def roll_out(
     if actor.cameras or video is not None:
         require_rendering()
     wanted, whole = seed_list(seeds, str(task), episodes)
+    setting = setting or str(trained.get("setting", "demo_clean"))
+    stamp = (str(task), setting, seeds_hash(whole), actor.name, sha, str(execution))
+    done = _finished(out, stamp) if resume and out is not None else {}
+    left = [seed for seed in wanted if seed not in done]
+    if not left:
+        return [done[seed] for seed in wanted]
 
     def keep(result: EpisodeResult, trace: EpisodeTrace) -> None:
         if out is not None:
@@ -138,8 +145,8 @@ def roll_out(
         results = run_episodes(
             actor,
             str(task),
-            wanted,
-            setting=setting or str(trained.get("setting", "demo_clean")),
+            left,
+            setting=setting,
             image_size=tuple(image_size or trained.get("image_size") or (120, 160)),  # type: ignore[arg-type]
             execution=execution,
             workers=min(workers, len(wanted)),
@@ -147,14 +154,28 @@ def roll_out(
             seeds_hash=seeds_hash(whole),
             on_result=keep,
             video_dir=scratch if video is not None else None,
-            video_seeds=wanted[:1],
+            video_seeds=left[:1],
         )
         if video is not None and results[0].video is not None:
             video.parent.mkdir(parents=True, exist_ok=True)
             video.with_name(video.name + ".partial").write_bytes(Path(results[0].video).read_bytes())
             video.with_name(video.name + ".partial").replace(video)
             print(f"video: {video}")
-    return results
+    done |= {result.seed: result for result in results}
+    return [done[seed] for seed in wanted]
+
+
+def _finished(out: Path, stamp: tuple[str | None, ...]) -> dict[int, EpisodeResult]:
+    """The episodes that a results file has already, by seed: of this task, setting, seed list, policy and execution."""
+    from ugr_lightning.rollout.results import drop_cut_off_line, read_results
+
+    drop_cut_off_line(out)
+    found = read_results(out) if out.is_file() else []
+    return {
+        item.seed: item
+        for item in found
+        if (item.task, item.setting, item.seeds_hash, item.policy, item.checkpoint, item.execution) == stamp
+    }
 
 
 def seed_list(which: Literal["evaluation", "selection"] | int, task: str, count: int) -> tuple[list[int], list[int]]:
@@ -192,6 +213,7 @@ def _test(
     out: str | None = None,
     traces: str | None = None,
     refine_ratio: float | None = None,
+    resume: bool = False,
 ) -> int:
     """Success of a checkpoint on the task's evaluation seeds, with aggregated chunks and with executed ones.
 
@@ -206,6 +228,7 @@ def _test(
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
         traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
+        resume: run only the episodes that the results file lacks.
     """
     from ugr_lightning.rollout.results import success_table
 
@@ -224,6 +247,7 @@ def _test(
             out=file,
             traces=None if traces is None else Path(traces),
             refine_ratio=refine_ratio,
+            resume=resume,
         )
     print(success_table(results))
     return 0

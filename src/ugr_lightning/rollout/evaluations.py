@@ -28,6 +28,7 @@ class RunInfo:
         checkpoint: file that is evaluated, relative to the benchmark's folder; None before it was trained.
         checkpoint_sha256: of that file.
         seconds: wall-clock seconds by part (`fit`, `test`), over all attempts.
+        modes: by execution as results say it, the name under which it is compared where that is another one.
     """
 
     policy: str
@@ -38,6 +39,7 @@ class RunInfo:
     checkpoint: str | None = None
     checkpoint_sha256: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    modes: dict[str, str] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
         """Write `run.json` into a folder, aside first."""
@@ -70,12 +72,14 @@ class Evaluation:
         training_seed: None where nothing beside the results tells it.
         source: the results file.
         results: its episodes; of one checkpoint, each task, setting, execution and seed once.
+        modes: by execution, the name under which it is compared where that is another one.
     """
 
     policy: str
     training_seed: int | None
     source: Path
     results: list[EpisodeResult]
+    modes: dict[str, str] = field(default_factory=dict)
 
 
 def read_benchmark(folder: str | Path) -> list[Evaluation]:
@@ -98,7 +102,7 @@ def read_benchmark(folder: str | Path) -> list[Evaluation]:
         if wrong:
             fix = "Remove the results file; `ugr benchmark` evaluates again."
             raise DataError(path, f"episodes of checkpoint {info.checkpoint_sha256}", f"also {wrong.pop()}", fix)
-        evaluations.append(Evaluation(info.policy, info.training_seed, path, results))
+        evaluations.append(Evaluation(info.policy, info.training_seed, path, results, info.modes))
     return evaluations
 
 

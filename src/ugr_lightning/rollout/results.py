@@ -100,6 +100,15 @@ def append_result(path: str | Path, result: EpisodeResult) -> None:
         os.fsync(file.fileno())
 
 
+def drop_cut_off_line(path: Path) -> None:
+    """Remove a last line that a crash has cut off while it was written; its episode is not finished."""
+    if not path.is_file():
+        return
+    with path.open("rb+") as file:
+        content = file.read()
+        file.truncate(content.rfind(b"\n") + 1)
+
+
 def read_results(path: str | Path) -> list[EpisodeResult]:
     """Read a results file.
 
