@@ -4,40 +4,40 @@ import json
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
+from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.training.checkpoint import describe
 
 
 @pytest.fixture
-def trained(tiny_config, ten_demonstrations):
-    assert (
-        main(
-            [
-                "fit",
-                "--config",
-                tiny_config,
-                "--data.episodes",
-                "10",
-                "--data.after_end",
-                "hold",
-                "--data.root",
-                str(ten_demonstrations),
-            ]
-        )
-        == 0
-    )
-    return ["analyze", "--data", str(ten_demonstrations), "--resamples", "20"]
+def command(ten_demonstrations, tmp_path):
+    """The command line for a checkpoint of a policy that was told the statistics and learned nothing."""
+    data = ChunkDataModule(root=str(ten_demonstrations), episodes=10, chunk_length=5, after_end="hold")
+    data.setup()
+    policy = TinyPolicy(cameras=CAMERAS, dim=14)
+    policy.set_statistics(data.statistics)
+    weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}
+    content = {"state_dict": weights, "policy": describe(policy, data), "global_step": 7, "epoch": 0}
+    torch.save(content, tmp_path / "policy_best.ckpt")
+    return ["analyze", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations), "--resamples", "20"]
 
 
-def test_analyze_writes_numbers_tables_and_figures_and_says_one_sentence(trained, capsys, tmp_path):
-    assert main(trained) == 0
+def test_analyze_writes_numbers_tables_and_figures_and_says_one_sentence(command, capsys, tmp_path):
+    assert main(command) == 0
     said = capsys.readouterr().out
-    folder = tmp_path / "runs" / "tiny" / "version_0" / "analysis-policy_best"
+    folder = tmp_path / "analysis-policy_best"
     found = json.loads((folder / "analysis.json").read_text())
     assert found["verdict"] in said
     assert "On 2 validation episodes s_k " in found["verdict"]
-    assert json.loads((folder / "prior.json").read_text()) == found["position"]["training_error"]
+    assert found["validation"] == {"episodes": 2, "chunks": 6}  # 12 steps, every fifth
+    prior = json.loads((folder / "prior.json").read_text())
+    assert prior == found["position"]["training_error"]
+    assert len(prior) == 5
     assert found["verdict"] in (folder / "analysis.md").read_text()
     assert {row["name"] for row in found["statistics"]} >= {"AUSE", "NLL, nats", "Spearman within position"}
     assert {"close", "open"} <= set(found["events"])  # the made-up grippers move at random
@@ -46,8 +46,16 @@ def test_analyze_writes_numbers_tables_and_figures_and_says_one_sentence(trained
     assert not list(folder.glob("*.partial"))
 
 
-def test_analyze_refuses_other_episodes_than_those_of_the_split(trained, ten_demonstrations, capsys):
+def test_analyze_refuses_other_episodes_than_those_of_the_split(command, ten_demonstrations, capsys):
     data = ten_demonstrations / "click_alarmclock" / "demo_clean" / "data"
     (data / "episode9.hdf5").rename(data / "episode10.hdf5")
-    assert main(trained) == 2
+    assert main(command) == 2
     assert "split" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("option", "says"), [("--budgets", "ranks"), ("--estimators", "ACT")])
+def test_what_a_policy_cannot_do_is_said_before_anything_is_computed(command, option, says, capsys):
+    assert main([*command, option]) == 2
+    said = capsys.readouterr()
+    assert says in said.err
+    assert "statistic" not in said.out

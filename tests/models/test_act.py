@@ -389,3 +389,10 @@ def test_base_with_the_parameters_of_uncert_has_exactly_as_many_and_learns_throu
     control.losses(batch)["loss"].backward()
     assert control.action_head.weight.grad.abs().sum() > 0
     assert control.branch.head.weight.grad.abs().sum() > 0
+
+
+def test_another_latent_is_another_style_and_zero_is_what_the_robot_executes(tiny, batch):
+    policy = tiny(refine=Uncertainty()).eval()
+    planned = policy.predict(batch.observation).actions
+    assert torch.equal(policy.predict(batch.observation, torch.zeros(3, 4)).actions, planned)
+    assert not torch.allclose(policy.predict(batch.observation, torch.ones(3, 4)).actions, planned)

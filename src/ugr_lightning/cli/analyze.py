@@ -4,7 +4,7 @@ import json
 import math
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 from ugr_lightning.errors import CheckpointError, ConfigError
 
@@ -26,6 +26,8 @@ def _analyze(
     stride: int = 5,
     after_end: Literal["mask", "hold"] | None = None,
     resamples: int = 500,
+    budgets: bool = False,
+    estimators: bool = False,
     out: str | None = None,
 ) -> int:
     """Say whether a policy's uncertainty knows the error, on the validation episodes of its own split.
@@ -38,6 +40,8 @@ def _analyze(
         stride: control steps between two queries.
         after_end: count steps past the end of an episode (`hold`) or not (`mask`); null does as the training did.
         resamples: draws of the bootstrap over episodes.
+        budgets: also the error when from none to all of the steps are refined, chosen by s_k and by its rivals.
+        estimators: also other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
         out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
     """
     from ugr_lightning.analysis import calibration_report as report
@@ -52,30 +56,27 @@ def _analyze(
             raise ConfigError(name, "at least 1", value, "Correct the number.")
     checkpoint = resolve_checkpoint(ckpt_path, run or newest_run(Path(root)), Path(root))
     policy, info = load_policy(checkpoint)
+    extras = [extra for wanted, extra in ((budgets, _budgets), (estimators, _estimators)) if wanted]
+    for extra in extras:
+        extra(policy, None)
     opened = open_data(policy, info.data, data, after_end)
-    fast = policy.for_inference()
-    validation = predict(fast, opened, opened.episode_split.validation, stride=stride)
+    split, fast = opened.episode_split, policy.for_inference()
+    validation = predict(fast, opened, split.validation, stride=stride)
     if validation.log_variance is None:
         fix = "Train with `refine` Uncertainty, or with `uncertainty_head: true`."
         raise CheckpointError(checkpoint, "a policy with a log-variance per step", "one without", fix)
-    training = predict(fast, opened, opened.episode_split.train, stride=stride)
+    training = predict(fast, opened, split.train, stride=stride)
     budget = getattr(policy, "budget", None) or int(0.3 * policy.chunk_length)
     rows = report.compare_with_prior(validation, training, budget, resamples)
-    sentence = report.verdict(rows, len(opened.episode_split.validation), budget)
-    found = report.curves(validation, training)
+    sentence = report.verdict(rows, len(split.validation), budget)
+    found, seen = report.curves(validation, training), report.generalisation(validation, training, budget)
     events = report.around_events(validation, opened.demonstrations, resamples)
-    seen = report.generalisation(validation, training, budget)
-    tables = [
-        report.table(rows),
-        report.generalisation_table(seen),
-        report.coverage_table(found),
-        report.event_table(events),
-    ]
-    print(f"checkpoint: {checkpoint}")
-    print("\n\n".join([*map(report.as_text, tables), sentence]))
+    tables = [report.table(rows), report.generalisation_table(seen)]
+    tables += [report.coverage_table(found), report.event_table(events)]
+    figures = {"calibration": calibration_figure(found), **({"events": event_figure(events)} if events else {})}
     content = {
         "checkpoint": {"file": str(checkpoint), "sha256": info.sha256, "task": opened.task},
-        "validation": {"episodes": len(opened.episode_split.validation), "chunks": len(validation.step)},
+        "validation": {"episodes": len(split.validation), "chunks": len(validation.step)},
         "settings": {"stride": stride, "after_end": opened.after_end, "resamples": resamples, "budget": budget},
         "verdict": sentence,
         "statistics": [row._asdict() for row in rows],
@@ -83,11 +84,60 @@ def _analyze(
         "events": events,
         **found,
     }
+    study = Study(opened, validation, training, stride, resamples, budget, content, tables, figures)
+    for extra in extras:
+        extra(policy, study)
+    print(f"checkpoint: {checkpoint}")
+    print("\n\n".join([*map(report.as_text, tables), sentence]))
     folder = Path(out) if out else checkpoint.with_name(f"analysis-{checkpoint.stem}")
-    figures = {"calibration": calibration_figure(found), **({"events": event_figure(events)} if events else {})}
     _write(folder, content, tables, figures)
     print(f"numbers, tables and figures: {folder}")
     return 0
+
+
+class Study(NamedTuple):
+    """What has been predicted and found so far; extras add to the last three."""
+
+    data: Any
+    validation: Any
+    training: Any
+    stride: int
+    resamples: int
+    budget: int
+    content: dict[str, Any]
+    tables: list[list[tuple[str, ...]]]
+    figures: dict[str, Any]
+
+
+def _budgets(policy: Any, study: Study | None) -> None:
+    """Add the sweep over budgets; without a study, only check that the policy can have others."""
+    from ugr_lightning.analysis.budgets import sweep, sweep_figure, sweep_table
+    from ugr_lightning.analysis.predictions import predict
+    from ugr_lightning.models.refine.budget import with_refine_ratio
+
+    whole = with_refine_ratio(policy, 1.0).for_inference()
+    if study is None:
+        return
+    everything = predict(whole, study.data, study.data.episode_split.validation, stride=study.stride)
+    found = sweep(everything, study.training.coarse, resamples=study.resamples)
+    study.content["budgets"] = found
+    study.tables.append(sweep_table(found))
+    study.figures["budgets"] = sweep_figure(found)
+
+
+def _estimators(policy: Any, study: Study | None) -> None:
+    """Add other estimates of the uncertainty; without a study, only check that the policy can give them."""
+    from ugr_lightning.analysis.estimators import estimate, estimator_table
+    from ugr_lightning.models.act import ACT
+
+    if not isinstance(policy, ACT):
+        raise ConfigError("--estimators", "a policy of the class ACT", type(policy).__name__, "Leave it out.")
+    if study is None:
+        return
+    estimates = estimate(policy, study.data, study.data.episode_split.validation, stride=study.stride)
+    table = estimator_table(study.validation, estimates, study.budget)
+    study.content["estimators"] = table
+    study.tables.append(table)
 
 
 def _write(folder: Path, content: dict[str, Any], tables: list[list[tuple[str, ...]]], figures: dict[str, Any]) -> None:

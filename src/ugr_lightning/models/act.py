@@ -230,11 +230,12 @@ class ACT(ChunkPolicy):
         return {"loss": total, **terms}
 
     @torch.no_grad()
-    def predict(self, observation: Observation) -> Chunk:
+    def predict(self, observation: Observation, latent: Tensor | None = None) -> Chunk:
         """The chunk to execute, with a latent of zero, in evaluation mode whatever mode the policy is in.
 
         Args:
             observation: what the robot sees now.
+            latent: (B, latent) another style of motion in place of zero, to study what the latent decides.
 
         Returns:
             The chunk, in robot units.
@@ -249,7 +250,8 @@ class ACT(ChunkPolicy):
             raise NumericsError("observation.state", "finite numbers", "a NaN or an infinity", fix)
         with self._evaluation_mode():
             state = self._disturb_state(self.normalizer.state(observation.state))  # (B, S)
-            latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
+            if latent is None:
+                latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
             whole = torch.ones(state.shape[0], self.chunk_length, dtype=torch.bool, device=state.device)
             plan = self._plan(observation.images, state, latent, whole)
             actions = self.normalizer.robot_action(plan.actions)  # (B, K, A)
