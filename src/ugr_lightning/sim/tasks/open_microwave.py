@@ -26,7 +26,8 @@ BAR_RADIUS, BAR_STANDOFF = 0.008, 0.044  # the bar's centre in front of the door
 GRASP_YAW, GRASP_PITCH = np.deg2rad(65.0), np.deg2rad(20.0)
 RETREAT = 0.10  # along the tool from the handle, where the straight approach begins
 PULLED = 0.72  # share of the limit at which the pull ends
-ARC_PIECES = 6
+ARC_PIECES, PIECE_STEPS = 6, 24  # straight lines that overlap by half: an arc at an even speed
+PULL_SLACK = 0.3
 
 DARK, GLASS, LINING, CHROME = (0.07, 0.07, 0.08), (0.13, 0.16, 0.19), (0.36, 0.35, 0.34), (0.80, 0.81, 0.83)
 
@@ -74,7 +75,7 @@ COLOURS: tuple[tuple[Colour, Colour, Colour], ...] = (
 class OpenMicrowave(TwoArmEnv):
     """A small microwave whose door hangs on the left; the left arm grasps the handle and pulls."""
 
-    horizon = 270
+    horizon = 310
     version = 1
 
     def build(self, rng: np.random.Generator) -> None:
@@ -113,13 +114,14 @@ class OpenMicrowave(TwoArmEnv):
 
     def expert(self, arms: Arms) -> Iterator[ExpertStep]:
         """In front of the handle, straight to it, close, and pull along the arc."""
-        yield from arms.move({"left": self.grasp(0.0, RETREAT)}, steps=50, phase="reach", overlap=10)
-        yield from arms.move({"left": self.grasp(0.0)}, steps=36, phase="approach", slack=(1.0, 0.3, 0.1, 0.0))
+        yield from arms.move({"left": self.grasp(0.0, RETREAT)}, steps=62, phase="reach", overlap=14)
+        yield from arms.move({"left": self.grasp(0.0)}, steps=38, phase="approach", slack=(1.0, 0.4, 0.2, 0.0))
         yield from arms.grip({"left": 0.0}, steps=12, phase="grasp")
         for piece in range(1, ARC_PIECES + 1):
             goal = self.grasp(PULLED * DOOR_LIMIT * piece / ARC_PIECES)
-            last = piece == ARC_PIECES
-            yield from arms.move({"left": goal}, steps=24, phase="pull", slack=(0.2,), overlap=0 if last else 12)
+            slack = (0.0, PULL_SLACK, PULL_SLACK) if piece == 1 else (PULL_SLACK,)
+            overlap = 0 if piece == ARC_PIECES else PIECE_STEPS // 2
+            yield from arms.move({"left": goal}, steps=PIECE_STEPS, phase="pull", slack=slack, overlap=overlap)
 
     def grasp(self, angle: float, retreat: float = 0.0) -> TcpPose:
         """Tool pose at the handle of a door that is open by `angle` rad, or `retreat` metres in front of it."""
@@ -186,7 +188,7 @@ def _add_controls(body: Prop, model: Model, at: tuple[float, float, float]) -> N
             tilt = rotation_y(0.7 - 1.1 * k)
             mark = np.array([x, y - 0.0205, z + dz]) + tilt @ np.array([0.0, 0.0, 0.009])
             body.box((0.003, 0.001, 0.014), tuple(mark), (0.95, 0.25, 0.10), rotation=tilt, solid=False)
-        body.box((0.04, 0.004, 0.010), (x, y - 0.001, z - 0.065), (0.75, 0.10, 0.08), solid=False)
+        body.box((0.04, 0.004, 0.010), (x, y - 0.001, z - 0.060), (0.75, 0.10, 0.08), solid=False)
         return
     body.box((0.058, 0.002, 0.026), (x, y - 0.001, z + 0.055), (0.02, 0.10, 0.09), solid=False)
     for k in range(4):  # the time
