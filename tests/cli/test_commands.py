@@ -2,6 +2,7 @@ from pathlib import Path
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.rollout.noise import Noise
+from ugr_lightning.sim.tasks import task_names
 
 
 def test_collect_hands_its_options_on(monkeypatch, capsys):
@@ -19,6 +20,17 @@ def test_collect_hands_its_options_on(monkeypatch, capsys):
     assert (options["episodes"], options["image_size"], options["workers"]) == (3, (6, 8), 1)
 
 
-def test_tasks_lists_them(capsys):
-    assert main(["tasks"]) == 0
-    assert "handover_block" in capsys.readouterr().out
+def test_collect_records_all_tasks_one_after_another(monkeypatch, capsys):
+    recorded = []
+    monkeypatch.setattr("ugr_lightning.rollout.collect.collect", lambda task, folder, **options: recorded.append(task))
+    assert main(["collect", "--task", "all", "--root", "d"]) == 0
+    assert recorded == list(task_names())
+    assert f"d/{recorded[-1]}/demo_clean" in capsys.readouterr().out
+
+
+def test_collect_explains_a_wrong_task_and_a_wrong_setting_before_it_makes_a_folder(tmp_path, capsys):
+    assert main(["collect", "--task", "click_alarm_clock", "--root", str(tmp_path)]) == 2
+    assert "Did you mean click_alarmclock" in capsys.readouterr().err
+    assert main(["collect", "--task", "all", "--setting", "demo_random", "--root", str(tmp_path)]) == 2
+    assert "Did you mean demo_randomized" in capsys.readouterr().err
+    assert not list(tmp_path.iterdir())

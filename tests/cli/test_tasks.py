@@ -1,0 +1,78 @@
+from pathlib import Path
+
+import pytest
+
+from ugr_lightning.cli.main import main
+from ugr_lightning.rollout.verify import Verification
+from ugr_lightning.sim.settings import SETTINGS
+from ugr_lightning.sim.tasks import task_names
+
+
+@pytest.fixture
+def calls(monkeypatch):
+    """What is asked for, in place of doing it."""
+    asked = []
+
+    def note(name, value):
+        def function(*args, **options):
+            asked.append((name, args, options))
+            return value
+
+        return function
+
+    where = "ugr_lightning.rollout"
+    monkeypatch.setattr(f"{where}.gallery.make_gallery", note("gallery", Path("gallery.md")))
+    monkeypatch.setattr(f"{where}.survey.survey", note("survey", "row"))
+    monkeypatch.setattr(f"{where}.survey.write_survey", note("write", "the table"))
+    monkeypatch.setattr(f"{where}.verify.verify_determinism", note("determinism", Verification("motion", 50, ())))
+    monkeypatch.setattr(f"{where}.verify.verify_evaluation_seeds", note("seeds", Verification("list", 101, (100007,))))
+    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", note("probe", None))
+    return asked
+
+
+def test_tasks_are_listed_all_or_one(capsys):
+    assert main(["tasks"]) == 0
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(task_names())
+    assert main(["tasks", "--task", "handover_block"]) == 0
+    assert capsys.readouterr().out.startswith("handover_block ")
+
+
+def test_measuring_goes_over_all_tasks_and_settings_and_prints_the_table(calls, capsys):
+    assert main(["tasks", "--measure", "out/table", "--recordings", "0", "--dummy_episodes", "7"]) == 0
+    surveys = [(args[0], options["setting"]) for name, args, options in calls if name == "survey"]
+    assert surveys == [(task, setting) for task in task_names() for setting in SETTINGS]
+    assert calls[0][2] == {"setting": "demo_clean", "episodes": 200, "dummy_episodes": 7, "recordings": 0, "workers": 2}
+    assert calls[1] == ("write", (Path("out/table"), "row"), {})
+    assert "probe" not in [name for name, _, _ in calls]
+    assert "the table" in capsys.readouterr().out
+
+
+def test_verifying_prints_every_comparison_and_a_difference_is_exit_code_2(calls, capsys):
+    assert main(["tasks", "--task", "click_alarmclock", "--verify", "--workers", "1"]) == 2
+    assert [name for name, _, _ in calls] == ["determinism", "determinism", "seeds"]
+    assert calls[0][2] == {"setting": "demo_clean", "episodes": 50, "workers": 1}
+    out = capsys.readouterr().out
+    assert "motion: 50 of 50 agree" in out
+    assert "list: 100 of 101 agree, not 100007" in out
+
+
+def test_the_gallery_shows_what_is_asked_for(calls, capsys):
+    options = ["--gallery", "pictures", "--task", "handover_block", "--setting", "demo_randomized"]
+    assert main(["tasks", *options]) == 0
+    assert [name for name, _, _ in calls] == ["probe", "gallery"]
+    assert calls[1][1] == ("pictures", ("handover_block",), ("demo_randomized",))
+    assert "gallery.md" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--task", "handover"], "Did you mean handover_block"),
+        (["--setting", "clean"], "demo_clean or demo_randomized"),
+        (["--verify", "--episodes", "0"], "0 episodes"),
+    ],
+)
+def test_wrong_values_are_explained_before_anything_runs(options, complaint, calls, capsys):
+    assert main(["tasks", *options]) == 2
+    assert complaint in capsys.readouterr().err
+    assert calls == []
