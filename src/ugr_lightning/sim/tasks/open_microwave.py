@@ -54,7 +54,7 @@ class Model(NamedTuple):
 
     @property
     def handle(self) -> Array:
-        """(3,) middle of the handle's bar, from the lower end of the hinge, x along the closed door, y into the body."""
+        """(3,) middle of the handle's bar from the lower end of the hinge; x along the closed door, y inwards."""
         return np.array([self.door[0] - 0.022, -DOOR - BAR_STANDOFF, self.door[1] / 2.0])
 
 
