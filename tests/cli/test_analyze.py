@@ -1,5 +1,6 @@
 """`ugr analyze` from a checkpoint to its tables and figures."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -51,6 +52,21 @@ def test_analyze_refuses_other_episodes_than_those_of_the_split(command, ten_dem
     (data / "episode9.hdf5").rename(data / "episode10.hdf5")
     assert main(command) == 2
     assert "split" in capsys.readouterr().err
+
+
+def test_failures_are_told_from_traces_of_this_checkpoint_alone(command, capsys, tmp_path):
+    assert main([*command, "--traces", str(tmp_path)]) == 2
+    assert "traces of this checkpoint" in capsys.readouterr().err
+    sha = hashlib.sha256((tmp_path / "policy_best.ckpt").read_bytes()).hexdigest()[:8]
+    for seed in range(30):
+        success, query = seed < 20, np.arange(40)
+        arrays = {"seed": seed, "success": success, "steps": 40, "query": query, "contacts": np.zeros((41, 2), bool)}
+        scores = np.full((40, 5), 0.01 * seed if success else 1.0)
+        np.savez(tmp_path / f"click_alarmclock-{sha}-TinyPolicy-25-{seed}.npz", **arrays, log_variance=scores)
+    assert main([*command, "--traces", str(tmp_path)]) == 0
+    assert "100% of 10 failures" in capsys.readouterr().out
+    found = json.loads((tmp_path / "analysis-policy_best" / "analysis.json").read_text())
+    assert found["failures"][f"click_alarmclock-{sha}-TinyPolicy-25"]["auroc"]["value"] == 1
 
 
 @pytest.mark.parametrize(("option", "says"), [("--budgets", "ranks"), ("--estimators", "ACT")])

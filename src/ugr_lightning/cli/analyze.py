@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.errors import CheckpointError, ConfigError, DataError
 
 
 def run(command: str, argv: Sequence[str]) -> int:
@@ -28,6 +28,7 @@ def _analyze(
     resamples: int = 500,
     budgets: bool = False,
     estimators: bool = False,
+    traces: str | None = None,
     out: str | None = None,
 ) -> int:
     """Say whether a policy's uncertainty knows the error, on the validation episodes of its own split.
@@ -42,6 +43,7 @@ def _analyze(
         resamples: draws of the bootstrap over episodes.
         budgets: also the error when from none to all of the steps are refined, chosen by s_k and by its rivals.
         estimators: also other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+        traces: folder that `ugr rollout --traces` filled; says whether s_k warned before episodes failed.
         out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
     """
     from ugr_lightning.analysis import calibration_report as report
@@ -87,10 +89,13 @@ def _analyze(
     study = Study(opened, validation, training, stride, resamples, budget, content, tables, figures)
     for extra in extras:
         extra(policy, study)
+    sentences = [sentence]
+    if traces is not None:
+        sentences += _failures(Path(traces), info.sha256, content)
     print(f"checkpoint: {checkpoint}")
-    print("\n\n".join([*map(report.as_text, tables), sentence]))
+    print("\n\n".join([*map(report.as_text, tables), *sentences]))
     folder = Path(out) if out else checkpoint.with_name(f"analysis-{checkpoint.stem}")
-    _write(folder, content, tables, figures)
+    _write(folder, content, sentences, tables, figures)
     print(f"numbers, tables and figures: {folder}")
     return 0
 
@@ -140,20 +145,37 @@ def _estimators(policy: Any, study: Study | None) -> None:
     study.tables.append(table)
 
 
-def _write(folder: Path, content: dict[str, Any], tables: list[list[tuple[str, ...]]], figures: dict[str, Any]) -> None:
+def _failures(folder: Path, sha256: str, content: dict[str, Any]) -> list[str]:
+    """One sentence on failure detection for each task and execution that has traces of this checkpoint."""
+    from ugr_lightning.analysis.failure import detect_failures
+    from ugr_lightning.rollout.traces import read_traces
+
+    groups: dict[str, list[Path]] = {}
+    for path in sorted(folder.glob(f"*-{sha256[:8]}-*.npz")):
+        groups.setdefault(path.stem.rpartition("-")[0], []).append(path)
+    if not groups:
+        fix = "Make some with `ugr rollout --policy CKPT --seeds selection --traces FOLDER`."
+        raise DataError(folder, "traces of this checkpoint", "none", fix)
+    found = {name: detect_failures(read_traces(paths)) for name, paths in groups.items()}
+    content["failures"] = found
+    return [f"{name}: {alarms}" for name, alarms in found.items()]
+
+
+def _write(
+    folder: Path,
+    content: dict[str, Any],
+    sentences: list[str],
+    tables: list[list[tuple[str, ...]]],
+    figures: dict[str, Any],
+) -> None:
     """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
     from ugr_lightning.analysis.calibration_report import as_markdown
     from ugr_lightning.data.folder import publish
 
     text = json.dumps(_plain(content), indent=1, allow_nan=False)
     prior = json.dumps(_plain(content["position"]["training_error"]))
-    pictures = [f"![{name}]({name}.png)" for name in figures]
-    parts = [
-        f"# Uncertainty of {content['checkpoint']['file']}",
-        content["verdict"],
-        *map(as_markdown, tables),
-        *pictures,
-    ]
+    title = f"# Uncertainty of {content['checkpoint']['file']}"
+    parts = [title, *sentences, *map(as_markdown, tables), *(f"![{name}]({name}.png)" for name in figures)]
     for name, written in (("analysis.json", text), ("prior.json", prior), ("analysis.md", "\n\n".join(parts))):
         publish(folder / name, lambda partial, written=written: partial.write_text(written + "\n") and None)
     for name, figure in figures.items():
