@@ -1,5 +1,6 @@
 """Put the mug down in the middle with the left arm, and hang it by its handle on the rack with the right arm."""
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,9 +12,10 @@ from ugr_lightning.sim.kinematics import HOME, UP, Array, TcpPose, rotation_y, r
 from ugr_lightning.sim.objects import Colour, Prop, pose_of
 from ugr_lightning.sim.scene import TwoArmEnv
 
-# Success (FACTS 9): the middle of the handle's opening against the middle of the peg, mug raised, right gripper open.
+# Success (FACTS 9): the middle of the handle's opening against the middle of the peg, right gripper open. RoboTwin also
+# wants the mug 12 cm above the table; here the peg, 27 cm high, has to pass through the handle. That is stricter:
+# success is latched, and a mug that is let go beside the peg falls through RoboTwin's region.
 TOLERANCE = 0.02  # in x and in y
-RAISED = 0.12  # the mug's origin above the table
 OPEN = 0.8
 
 # Randomisation. FACTS 9 has the rack at x 0.1 .. 0.3, where the peg would meet the hand of the resting right arm, and
@@ -23,7 +25,12 @@ MUG_YAW = (-0.8, 0.8)  # of the handle, from pointing at the left arm
 RACK_X, RACK_Y, RACK_YAW = (0.0, 0.1), (0.15, 0.19), (-0.2, 0.2)
 MUG_RADIUS, MUG_HEIGHT = (0.024, 0.027), (0.078, 0.09)
 HANDLE_REACH = (0.036, 0.042)  # from the wall to the outside of the handle
-MUG_COLOURS: tuple[Colour, ...] = ((0.10, 0.28, 0.75), (0.80, 0.10, 0.10), (0.05, 0.50, 0.28), (0.45, 0.15, 0.60))
+MUG_COLOURS: dict[str, Colour] = {
+    "blue": (0.10, 0.28, 0.75),
+    "red": (0.80, 0.10, 0.10),
+    "green": (0.05, 0.50, 0.28),
+    "purple": (0.45, 0.15, 0.60),
+}
 
 WALL, FLOOR, TUBE = 0.0044, 0.006, 0.0045  # thickness of the mug, radius of its handle
 SIDES_OF_MUG = 12  # flat walls; two of them face the fingers
@@ -48,11 +55,15 @@ class HangingMug(TwoArmEnv):
         self.radius, self.height, self.reach = (
             rng.uniform(*limits) for limits in (MUG_RADIUS, MUG_HEIGHT, HANDLE_REACH)
         )
-        colour = MUG_COLOURS[rng.integers(len(MUG_COLOURS))]
+        self.colour = list(MUG_COLOURS)[rng.integers(len(MUG_COLOURS))]
         self.mug_start, self.rack = (x, y, np.pi + turn), (rack_x, rack_y, rack_yaw)
         # Level with the centre of mass: the mug then hangs level.
-        self.opening_middle = np.array([self.radius + (self.reach - 2 * TUBE) / 2.0, 0.0, 0.44 * self.height])
-        self.mug: Actor = self._mug(colour).build("mug", pose_of((x, y, 0.0005), rotation_z(np.pi + turn)))
+        self.opening_middle = np.array([self.radius + self.reach / 2.0 - TUBE, 0.0, 0.44 * self.height])
+        # Half-axes of the half ellipse that the handle follows, outwards from the wall and along the mug.
+        self.handle_axes = (self.reach - TUBE, self.opening_middle[2] - TUBE - 0.005)
+        self.mug: Actor = self._mug(MUG_COLOURS[self.colour]).build(
+            "mug", pose_of((x, y, 0.0005), rotation_z(np.pi + turn))
+        )
         turned = rotation_z(rack_yaw)
         self.peg_direction = turned @ np.array([0.0, -np.cos(PEG_TILT), np.sin(PEG_TILT)])
         self.peg_root = np.array([rack_x, rack_y, PEG_HEIGHT])
@@ -71,11 +82,11 @@ class HangingMug(TwoArmEnv):
             turned = rotation_z(2.0 * np.pi * k / SIDES_OF_MUG)
             x, y, _ = turned @ np.array([r - WALL / 2.0, 0.0, 0.0])
             mug.box((WALL, width, h - FLOOR), (x, y, (h + FLOOR) / 2.0), None, rotation=turned)
-        height = self.opening_middle[2]
+        out, along = self.handle_axes
         arc = np.linspace(-np.pi / 2.0, np.pi / 2.0, 11)
-        x, z = r + (self.reach - TUBE) * np.cos(arc), height + (height - TUBE - 0.005) * np.sin(arc)
+        x, z = r + out * np.cos(arc), self.opening_middle[2] + along * np.sin(arc)
         points = np.stack([x, np.zeros_like(x), z], axis=1)  # (11, 3)
-        for start, end in zip(points[:-1], points[1:], strict=True):
+        for start, end in itertools.pairwise(points):
             mug.capsule(start, end, TUBE, colour)
         return mug
 
@@ -102,15 +113,16 @@ class HangingMug(TwoArmEnv):
         )
         if root[1] * tip[1] >= 0.0:
             return False
-        crossing = root + (tip - root) * root[1] / (root[1] - tip[1])
-        from_middle = crossing - self.opening_middle
-        return bool(abs(from_middle[0]) < self.reach / 2.0 and abs(from_middle[2]) < self.opening_middle[2])
+        crossing = root + (tip - root) * root[1] / (root[1] - tip[1])  # (3,) where the peg meets the handle's plane
+        out = (crossing[0] - self.radius) / self.handle_axes[0]
+        along = (crossing[2] - self.opening_middle[2]) / self.handle_axes[1]
+        return bool(out > 0.0 and np.hypot(out, along) < 1.0)
 
     def condition(self) -> bool:
         """The mug hangs on the middle of the peg and the right gripper is open."""
         origin, rotation = self.mug_pose()
         offset = origin + rotation @ self.opening_middle - self.peg_root - PEG_LENGTH / 2.0 * self.peg_direction
-        placed = bool((np.abs(offset[:2]) < TOLERANCE).all()) and origin[2] > RAISED
+        placed = bool((np.abs(offset[:2]) < TOLERANCE).all())
         return placed and self.on_peg() and self.opening("right") > OPEN
 
     def expert(self, arms: Arms) -> Iterator[ExpertStep]:
@@ -153,7 +165,7 @@ class HangingMug(TwoArmEnv):
         yield from arms.move(
             {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.2, 0.15, 0.1)
         )
-        drop = (self.reach - 2 * TUBE) / 2.0 - PEG_RADIUS + REST
+        drop = self.reach / 2.0 - TUBE - PEG_RADIUS + REST
         yield from arms.move({"right": self._hanging(PEG_LENGTH / 2.0, drop)}, steps=12, phase="rest", slack=(0.1, 0.0))
         yield from arms.grip({"right": 1.0}, steps=10, phase="release-right")
         last = arms.pose("right")
@@ -188,11 +200,12 @@ class HangingMug(TwoArmEnv):
         return TcpPose(origin + turn @ (tool[:3, 3] - held.position), turn @ tool[:3, :3])
 
     def describe(self) -> dict[str, Any]:
-        """Where mug and rack were at the start, and the mug's shape."""
+        """Where mug and rack were at the start, and the mug's shape and colour."""
         return {
             "mug": [float(value) for value in self.mug_start],
             "rack": [float(value) for value in self.rack],
             "mug_shape": {"radius": float(self.radius), "height": float(self.height), "handle": float(self.reach)},
+            "colour": self.colour,
         }
 
 
