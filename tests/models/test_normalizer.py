@@ -31,6 +31,17 @@ def test_min_max_maps_the_range_to_one_and_a_still_dimension_to_zero(statistics:
     expected = torch.ones(14)
     expected[3] = 0
     assert torch.allclose(normalizer.action(statistics.action_max), expected, atol=1e-5)
+    assert torch.allclose(normalizer.action(low)[expected == 1], -torch.ones(13), atol=1e-5)
+
+
+def test_min_max_returns_a_still_dimension_to_the_value_it_always_had(statistics: Statistics):
+    still = statistics.action_min.clone()
+    still[3] = statistics.action_max[3]
+    normalizer = Normalizer(14, 14, "min_max")
+    normalizer.fit(statistics._replace(action_min=still))
+    noise = torch.randn(5, 14)
+    assert (normalizer.robot_action(noise)[:, 3] == statistics.action_max[3]).all()
+    assert (normalizer.action(noise)[:, 3] == 0).all()
 
 
 def test_a_joint_that_never_moves_does_not_blow_up(statistics: Statistics):

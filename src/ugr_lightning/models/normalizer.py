@@ -18,7 +18,8 @@ class Normalizer(nn.Module):
     Args:
         state_dim, action_dim: S and A.
         mode: `mean_std` gives zero mean and unit variance; `min_max` maps the training range to -1 .. 1 (Diffusion
-            Policy).
+            Policy). A dimension that never moved in training then maps to 0, and comes back as the value it always
+            had: what is left of the noise would otherwise reach that joint unscaled, in radians.
 
     Source: FACTS 2.6 (std floored at 1e-2), FACTS 8 (min-max).
     """
@@ -59,8 +60,7 @@ class Normalizer(nn.Module):
                 new_shift, new_scale = mean, std.clamp_min(STD_FLOOR)
             else:
                 half = (high - low) / 2
-                # A dimension that never moves maps to 0, and its range is not blown up.
-                new_shift, new_scale = (high + low) / 2, torch.where(half > RANGE_FLOOR, half, torch.ones_like(half))
+                new_shift, new_scale = (high + low) / 2, torch.where(half > RANGE_FLOOR, half, torch.zeros_like(half))
             if not (new_shift.isfinite().all() and new_scale.isfinite().all()):
                 fix = "Look for damaged episodes with `ugr inspect`."
                 raise DataError(f"{name} statistics", "finite numbers", "a NaN or an infinity", fix)
@@ -71,12 +71,12 @@ class Normalizer(nn.Module):
     def state(self, state: Tensor) -> Tensor:
         """(..., S) robot units to (..., S) float32 network units."""
         self._require_fit()
-        return (state.float() - self.state_shift) / self.state_scale
+        return _normalised(state, self.state_shift, self.state_scale)
 
     def action(self, action: Tensor) -> Tensor:
         """(..., A) robot units to (..., A) float32 network units."""
         self._require_fit()
-        return (action.float() - self.action_shift) / self.action_scale
+        return _normalised(action, self.action_shift, self.action_scale)
 
     def robot_action(self, action: Tensor) -> Tensor:
         """(..., A) network units to (..., A) float32 robot units."""
@@ -87,3 +87,8 @@ class Normalizer(nn.Module):
         if not self.fitted:
             fix = "Call `set_statistics` with those of the training episodes, or load a checkpoint that has them."
             raise CheckpointError("normalisation statistics", "fitted ones", "none", fix)
+
+
+def _normalised(values: Tensor, shift: Tensor, scale: Tensor) -> Tensor:
+    still = scale == 0
+    return (values.float() - shift).masked_fill(still, 0.0) / scale.masked_fill(still, 1.0)
