@@ -44,13 +44,13 @@ class FakeSimulator:
         self.task, self.setting, self.image_size, self.render = task, setting, image_size, render
         self.steps = 0
 
-    def reset(self, seed):
+    def reset(self, seed, *, look=True):
         self.seed, self.steps, self.success = seed, 0, False
         self.goal = GOAL + 0.02 * (seed % 7)
         self.commanded = self.measured = HOME.copy()
-        return self._frame()
+        return self._frame(look)
 
-    def step(self, action):
+    def step(self, action, *, look=True):
         assert np.isfinite(action).all(), "a simulator must never see this"
         self.steps += 1
         if self.seed == 2 and self.steps == 3:
@@ -59,7 +59,7 @@ class FakeSimulator:
         self.measured = (0.2 * self.measured + 0.8 * self.commanded).astype(np.float32)
         near = abs(float(self.measured[0]) - self.goal) < 0.05 and self.task != "unsolvable"
         self.success = self.success or near
-        return self._frame()
+        return self._frame(look)
 
     def expert(self):
         if self.seed % 5 == 3:
@@ -91,9 +91,9 @@ class FakeSimulator:
         if self.task == "faulty":
             raise ValueError("the scene fell over")
 
-    def _frame(self):
+    def _frame(self, look=True):
         height, width = self.image_size
-        images = np.zeros((3 if self.render else 0, height, width, 3), np.uint8)
+        images = np.zeros((3 if self.render and look else 0, height, width, 3), np.uint8)
         for view in range(len(images)):
             images[view, ..., view] = 40 * view + self.steps
             images[view, : height // 2, :, :] = round(300 * (self.goal - GOAL)) + 40

@@ -6,12 +6,14 @@ from fake_simulator import FakeSimulator
 
 from ugr_lightning.contract import CAMERAS
 from ugr_lightning.errors import CheckpointError, ConfigError
-from ugr_lightning.rollout.actors import Actor, Decision, PolicyActor, make_actor
-from ugr_lightning.rollout.runner import Runner, run_episodes
+from ugr_lightning.rollout.actors import ROWS, Actor, Decision, PolicyActor, make_actor
+from ugr_lightning.rollout.runner import Runner, Runners, run_episodes
 from ugr_lightning.sim.seeds import seeds_hash
 
 SMALL = {"image_size": (24, 32), "progress": False, "simulator": FakeSimulator}
 SEEDS = [9, 0, 1, 2, 3, 4]
+PROBES = ROWS
+"""Queries that find out which sizes of a batch give the same bits, with four slots."""
 
 
 def run(actor, seeds=SEEDS, task="reach", **more):
@@ -67,14 +69,70 @@ def test_the_motion_hash_tells_episodes_apart_and_knows_a_repetition(runner):
     assert first != other
 
 
-def test_every_query_has_the_full_batch_as_uint8_without_a_copy_to_channels_first(runner):
+def test_queries_have_a_row_for_each_slot_that_asks_as_uint8_without_a_copy_to_channels_first(runner):
     policy = Reacher()
     policy.train()
     runner.run(policy, SEEDS, progress=False)
-    assert set(policy.batch_sizes) == {runner.slots}
-    assert set(policy.layouts) == {((4, 3, 3, 24, 32), torch.uint8, True)}
+    assert policy.batch_sizes[PROBES:][0] == runner.slots
+    assert policy.batch_sizes[-1] < runner.slots, "fewer episodes than slots are left"
+    assert {(shape[1:], *rest) for shape, *rest in policy.layouts} == {((3, 3, 24, 32), torch.uint8, True)}
     assert set(policy.modes) == {False}
     assert policy.training
+
+
+class Rounding(Reacher):
+    """Its last bits depend on the number of rows, as those of a matrix product may."""
+
+    def predict(self, observation):
+        chunk = super().predict(observation)
+        return chunk._replace(actions=chunk.actions + 1e-6 * len(observation.images))
+
+
+def test_where_rounding_depends_on_the_batch_all_queries_have_one_size_whatever_the_slots():
+    motions = []
+    for workers, slots in ((1, 1), (1, 6), (2, 2)):
+        policy = Rounding()
+        results = run(policy, workers=workers, slots_per_worker=slots)
+        motions.append([result.motion_hash for result in results])
+        assert set(policy.batch_sizes[1 + min(workers * slots, ROWS - 1) :]) == {ROWS}
+    assert motions[0] == motions[1] == motions[2]
+
+
+class Watching(PolicyActor):
+    """Remembers, step by step, whether the frames had pictures."""
+
+    def begin(self, slots, execution):
+        super().begin(slots, execution)
+        self.seen = []
+
+    def act(self, frames):
+        self.seen += [bool(len(frame.images)) for frame in frames.values()]
+        return super().act(frames)
+
+
+def test_pictures_are_taken_only_for_queries_and_videos(tmp_path):
+    for policy, observations, expected in (
+        (Reacher(), 1, [True, False, False]),
+        (Remembering(), 2, [True, False, True]),
+    ):
+        policy.observation_steps = observations
+        actor = Watching(policy)
+        result = run(actor, [5], execution=3)[0]
+        assert actor.seen == (expected * 7)[: result.steps]
+    run(actor, [5], execution=3, video_dir=tmp_path)
+    assert all(actor.seen)
+
+
+def test_simulators_stay_open_between_calls_where_they_are_kept():
+    options = {"workers": 1, "keep": (kept := Runners())}
+    with kept:
+        pids = []
+        for execution in ("aggregate", 5):
+            assert all(result.success for result in run(Reacher(), execution=execution, **options))
+            (opened,) = kept._opened.values()
+            pids += [worker.pid for worker in opened._workers]
+        assert pids[0] == pids[1]
+    assert opened._workers[0].pid is None
 
 
 def test_cameras_are_found_by_name(runner):
@@ -97,7 +155,7 @@ def test_an_unknown_camera_is_refused_by_name():
 def test_a_policy_sees_the_joints_it_was_trained_on(runner, state):
     policy, traces = Reacher(), []
     runner.run(PolicyActor(policy, state=state), [0], on_result=lambda result, trace: traces.append(trace))
-    seen = torch.stack([states[0] for states in policy.states]).numpy()
+    seen = torch.stack([states[0] for states in policy.states[PROBES:]]).numpy()
     frames = traces[0].frames[:-1]
     assert np.array_equal(seen, np.stack([getattr(frame, state) for frame in frames]))
     assert not np.array_equal(frames[-1].commanded, frames[-1].measured)
@@ -121,7 +179,7 @@ def test_a_policy_of_several_observations_sees_the_steps_just_before_also_those_
     policy.observation_steps = 3
     keep = {"on_result": lambda result, trace: traces.append(trace)}
     results = run(policy, seeds=[5, 6], workers=1, slots_per_worker=1, execution=4, **keep)
-    seen = iter(zip(policy.histories, policy.pixels, strict=True))
+    seen = iter(zip(policy.histories[2:], policy.pixels[2:], strict=True))  # without the two on noise
     for result, trace in zip(results, traces, strict=True):
         for step in range(0, result.steps, 4):
             past = [max(0, step - 2), max(0, step - 1), step]  # before the start: the first, never the last episode
@@ -135,7 +193,7 @@ def test_a_policy_of_several_observations_sees_the_steps_just_before_also_those_
 def test_chunks_are_queried_only_when_used_up(runner):
     policy = Reacher()
     results = runner.run(policy, [0], execution=5, progress=False)
-    assert len(policy.batch_sizes) == -(-results[0].steps // 5)
+    assert len(policy.batch_sizes) - PROBES == -(-results[0].steps // 5)
 
 
 def test_nan_never_reaches_the_simulator_and_names_step_and_seed():
@@ -163,13 +221,20 @@ def test_a_nan_later_in_the_episode_is_caught_at_its_step(runner):
 
 @pytest.mark.parametrize(
     ("task", "slots", "message"),
-    [("deadly", 1, "SIGKILL"), ("hang", 1, "did not answer"), ("faulty", 2, "ValueError: the scene fell over")],
+    [
+        ("deadly", 1, "SIGKILL"),
+        ("deadly", 2, "SIGKILL"),
+        ("hang", 2, "did not answer within 5 s"),
+        ("faulty", 2, "ValueError: the scene fell over"),
+    ],
 )
 def test_a_crash_costs_its_own_episode_only(task, slots, message):
     results = run("expert", seeds=[0, 1, 2, 4, 5], task=task, workers=2 // slots, slots_per_worker=slots, timeout_s=5)
     assert [result.success for result in results] == [True, True, False, True, True]
     assert message in results[2].crash
     assert [result.crash for result in results if result.seed != 2] == [None] * 4
+    healthy = run("expert", seeds=[0, 1, 4, 5])
+    assert [result.motion_hash for result in results if result.seed != 2] == [one.motion_hash for one in healthy]
 
 
 def test_results_arrive_as_they_come_with_their_trace_and_video(runner, tmp_path):

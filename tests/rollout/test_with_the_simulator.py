@@ -1,5 +1,7 @@
 """The same rooms joined with the real simulator, on tiny pictures."""
 
+import os
+import signal
 from functools import partial
 
 import numpy as np
@@ -8,7 +10,7 @@ import pytest
 from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.data.jpeg import decode_jpeg, encode_frame
 from ugr_lightning.rollout import recorder
-from ugr_lightning.rollout.actors import Actor, Decision
+from ugr_lightning.rollout.actors import Actor, Decision, Random
 from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.runner import Runner
 from ugr_lightning.rollout.workers import open_simulator
@@ -92,3 +94,29 @@ def test_the_same_seeds_end_in_the_same_joints(runner):
 
     once, again = final([3, 4, 5]), final([5, 4, 3])
     assert all(np.array_equal(once[seed], again[seed]) for seed in once)
+
+
+class Assassin(Random):
+    """Kills a simulator's process once, in the middle of the episodes."""
+
+    def __init__(self, worker):
+        super().__init__()
+        self._worker, self._calls = worker, 0
+
+    def act(self, frames):
+        self._calls += 1
+        if self._calls == 20:
+            os.kill(self._worker.pid, signal.SIGKILL)
+        return super().act(frames)
+
+
+def test_a_simulator_killed_in_the_middle_costs_one_flagged_episode_and_nothing_else(runner):
+    seeds = [3, 4, 5]
+    undisturbed = runner.run("random", seeds, progress=False)
+    results = runner.run(Assassin(runner._workers[0]), seeds, progress=False)
+    flagged = [result for result in results if result.crash is not None]
+    assert len(flagged) == 1
+    assert "SIGKILL" in flagged[0].crash
+    assert not flagged[0].success
+    motions = {result.seed: (result.motion_hash, result.success) for result in undisturbed}
+    assert all((result.motion_hash, result.success) == motions[result.seed] for result in results if not result.crash)

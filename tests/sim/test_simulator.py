@@ -161,6 +161,19 @@ def test_every_task_makes_a_gymnasium_environment():
     environment.close()
 
 
+def test_steps_that_nobody_looks_at_change_no_later_picture(click):
+    always, rarely = click.reset(6), click.reset(6, look=False)
+    assert rarely.images.shape == (0, 30, 40, 3)
+    actions = np.linspace(HOME, HOME + 0.3, 7)
+    click.reset(6)
+    for action in actions:
+        always = click.step(action)
+    click.reset(6, look=False)
+    for index, action in enumerate(actions):
+        rarely = click.step(action, look=index == len(actions) - 1)
+    assert_identical([always], [rarely])
+
+
 def test_rendering_changes_nothing_in_the_physics(click):
     with Simulator("click_alarmclock", render=False) as blind:
         for seen, unseen in zip(play(click, 6), play(blind, 6), strict=True):

@@ -12,6 +12,9 @@ from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.rollout.aggregation import Execution, make_execution
 from ugr_lightning.rollout.noise import GRIPPERS
 
+ROWS = 4
+"""Rows of a whole query; fewer would make poor use of a processor, more would often be idle."""
+
 
 class Decision(NamedTuple):
     """What an actor does with a slot in this control step.
@@ -52,6 +55,10 @@ class Actor(ABC):
     @abstractmethod
     def start(self, slot: int, seed: int, frame: Any) -> None:
         """An episode begins in a slot; `frame` is its first one."""
+
+    def looks(self, slot: int) -> bool:
+        """Whether the pictures of the frame that the slot's last decision leads to matter; they are most of a step."""
+        return bool(self.cameras)
 
     @abstractmethod
     def act(self, frames: Mapping[int, Any]) -> dict[int, Decision]:
@@ -124,8 +131,9 @@ class Expert(Actor):
 class PolicyActor(Actor):
     """A policy, queried once per control step for all slots that need a chunk.
 
-    The batch always has one row per slot, used or not, so that the size of the batch, which decides how sums are
-    split up, never depends on which episodes happen to be running.
+    The number of rows of a query can decide how sums are split up, and so the last bits of what comes out. For an
+    episode to go the same way whatever the number of slots, and whichever others are running, a query has `ROWS` rows,
+    some of them idle; or as few as ask, where this machine has shown that it computes the same bits then.
 
     Args:
         policy: predicts the chunks.
@@ -152,6 +160,7 @@ class PolicyActor(Actor):
         policy = self.policy
         self._execution = make_execution(execution, policy.chunk_length, policy.action_dim, slots)
         self.execution = self._execution.name
+        self._sizes: list[int] | None = None  # numbers of rows that a query may have
         self._state = torch.zeros(slots, policy.observation_steps, policy.state_dim)  # (B, T, S), oldest first
         self._images: torch.Tensor | None = None
         self._new: set[int] = set()  # slots whose episode begins
@@ -178,12 +187,17 @@ class PolicyActor(Actor):
         asking = [slot for slot in sorted(frames) if self._execution.needs_query(slot)]
         uncertainty: dict[int, np.ndarray] = {}
         if asking:
-            chunks, log_variance = self._query()
-            for slot in asking:
+            chunks, log_variance = self._query(asking)
+            for row, slot in enumerate(asking):
                 if log_variance is not None:
-                    uncertainty[slot] = log_variance[slot]
-                self._execution.push(slot, chunks[slot], uncertainty.get(slot))
+                    uncertainty[slot] = log_variance[row]
+                self._execution.push(slot, chunks[row], uncertainty.get(slot))
         return {slot: Decision(self._execution.next(slot), uncertainty.get(slot)) for slot in frames}
+
+    def looks(self, slot: int) -> bool:
+        """Where a query is so near that it will have the next frame among its observations."""
+        assert self._execution is not None
+        return self._execution.steps_left(slot) < self.policy.observation_steps
 
     def _see(self, slot: int, frame: Any) -> None:
         """Put a frame behind the slot's earlier ones; the first of an episode takes the place of all."""
@@ -192,17 +206,45 @@ class PolicyActor(Actor):
             self._images = torch.zeros(shape, dtype=torch.uint8)  # (B, T, V, H, W, 3)
         kept = slice(None) if slot in self._new else slice(-1, None)
         self._new.discard(slot)
-        for past, now in (
-            (self._images[slot], torch.from_numpy(frame.images[self._views])),  # (T, V, H, W, 3), (V, H, W, 3)
-            (self._state[slot], torch.from_numpy(np.asarray(getattr(frame, self.state), np.float32))),  # (T, S), (S,)
-        ):
+        for past in (self._images[slot], self._state[slot]):  # (T, V, H, W, 3), (T, S)
             past[:-1] = past[1:].clone()
-            past[kept] = now
+        if len(frame.images):  # else no query will see this frame
+            self._images[slot][kept] = torch.from_numpy(frame.images[self._views])  # (V, H, W, 3)
+        self._state[slot][kept] = torch.from_numpy(np.asarray(getattr(frame, self.state), np.float32))  # (S,)
 
-    def _query(self) -> tuple[np.ndarray, np.ndarray | None]:
-        """Chunks (B, K, A) and s_k (B, K) for what all slots see."""
+    def _query(self, slots: list[int]) -> tuple[np.ndarray, np.ndarray | None]:
+        """Chunks (B, K, A) and s_k (B, K) for what some slots see, in their order."""
         assert self._images is not None
-        images, state = self._images.to(self._device), self._state.to(self._device)
+        if self._sizes is None:
+            self._sizes = self._exact_sizes(min(ROWS, len(self._state)))
+        chunks, log_variance = [], []
+        for first in range(0, len(slots), ROWS):
+            asking = slots[first : first + ROWS]
+            size = next(size for size in self._sizes if size >= len(asking))
+            rows = asking + asking[:1] * (size - len(asking))
+            answer = self._predict(self._images[rows], self._state[rows])
+            chunks.append(answer[0][: len(asking)])
+            if answer[1] is not None:
+                log_variance.append(answer[1][: len(asking)])
+        return np.concatenate(chunks), np.concatenate(log_variance) if log_variance else None
+
+    def _exact_sizes(self, most: int) -> list[int]:
+        """Numbers of rows up to `most` at which noise is answered as among `ROWS` rows, bit for bit; and `ROWS`."""
+        assert self._images is not None
+        noise = torch.Generator().manual_seed(0)
+        images = torch.randint(256, (ROWS, *self._images.shape[1:]), generator=noise, dtype=torch.uint8)
+        state = self._state[:1] + 0.1 * torch.randn(ROWS, *self._state.shape[1:], generator=noise)  # (ROWS, T, S)
+        whole = self._predict(images, state)
+        sizes = []
+        for size in range(1, min(most, ROWS - 1) + 1):
+            part = self._predict(images[:size], state[:size])
+            if all(a is None or np.array_equal(a[:size], b) for a, b in zip(whole, part, strict=True)):
+                sizes.append(size)
+        return [*sizes, ROWS]
+
+    def _predict(self, images: torch.Tensor, state: torch.Tensor) -> tuple[np.ndarray, np.ndarray | None]:
+        """Chunks and s_k of images (B, T, V, H, W, 3) and states (B, T, S)."""
+        images, state = images.to(self._device), state.to(self._device)
         if self.policy.observation_steps == 1:
             images, state = images[:, 0], state[:, 0]  # (B, V, H, W, 3), (B, S)
         with torch.no_grad():  # not inference_mode: what a policy caches here must still serve its training

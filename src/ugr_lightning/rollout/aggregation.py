@@ -27,6 +27,10 @@ class Execution(ABC):
     def needs_query(self, slot: int) -> bool:
         """Whether the slot wants a new chunk before its next action."""
 
+    def steps_left(self, slot: int) -> int:
+        """How many actions of the slot are known before it wants a new chunk."""
+        return 0
+
     @abstractmethod
     def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
         """Give a slot the chunk (K, A), and s_k (K,) if there is one, that was predicted at its current step."""
@@ -126,7 +130,11 @@ class ChunkExecution(Execution):
 
     def needs_query(self, slot: int) -> bool:
         """True at the start of an episode and whenever the steps of the last chunk are used up."""
-        return self._chunks[slot] is None or self._cursors[slot] >= self._steps
+        return self.steps_left(slot) == 0
+
+    def steps_left(self, slot: int) -> int:
+        """The steps of the last chunk that have not been executed."""
+        return 0 if self._chunks[slot] is None else self._steps - self._cursors[slot]
 
     def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
         """Replace the slot's chunk by a new one (K, A)."""

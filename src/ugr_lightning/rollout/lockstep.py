@@ -2,6 +2,7 @@
 
 import hashlib
 import time
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -109,7 +110,7 @@ class LockStep:
     def __init__(
         self,
         slots: int,
-        advance: Callable[[dict[int, Order]], tuple[dict[int, Reply], dict[int, str]]],
+        advance: Callable[[dict[int, Order]], tuple[dict[int, Reply], dict[int, str | None]]],
         actor: Actor,
         seeds: list[int],
         filmed: set[int],
@@ -128,20 +129,25 @@ class LockStep:
 
     def finish(self) -> list[EpisodeResult]:
         """Run all episodes; results in the order of the seeds."""
-        waiting = list(enumerate(self._seeds))
+        waiting = deque(enumerate(self._seeds))
         while waiting or self._running:
             orders = self._decide()
             for slot in range(self._slots):
                 if slot not in self._running and waiting:
-                    position, seed = waiting.pop(0)
-                    self._running[slot] = (position, Episode(seed, seed in self._filmed))
-                    orders[slot] = Order(slot, seed=seed)
+                    position, seed = waiting.popleft()
+                    episode = Episode(seed, seed in self._filmed)
+                    self._running[slot] = (position, episode)
+                    orders[slot] = Order(slot, seed=seed, look=episode.filmed or bool(self._actor.cameras))
             replies, lost = self._advance(orders)
             for slot in sorted(orders):
-                if slot in lost:
-                    self._end(slot, lost[slot])
-                else:
+                if slot not in lost:
                     self._take(slot, orders[slot], replies[slot])
+                elif (fault := lost[slot]) is not None:
+                    self._end(slot, fault)
+                else:  # it ran beside the one that fell over, and begins anew
+                    position, episode = self._running.pop(slot)
+                    self._frames.pop(slot, None)
+                    waiting.appendleft((position, episode.seed))
         return [self._results[position] for position in range(len(self._seeds))]
 
     def _decide(self) -> dict[int, Order]:
@@ -161,7 +167,8 @@ class LockStep:
                 continue
             episode.trace.actions.append(decisions[slot].action)
             episode.trace.log_variance.append(decisions[slot].log_variance)
-            orders[slot] = Order(slot, action=decisions[slot].action)
+            look = episode.filmed or self._actor.looks(slot)
+            orders[slot] = Order(slot, action=decisions[slot].action, look=look)
         return orders
 
     def _take(self, slot: int, order: Order, reply: Reply) -> None:

@@ -1,6 +1,6 @@
 """Closed-loop episodes: simulators in worker processes, the policy in this one, all slots in lock-step."""
 
-import time
+from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from functools import partial
 from pathlib import Path
@@ -13,15 +13,18 @@ from ugr_lightning.rollout.actors import Actor, make_actor
 from ugr_lightning.rollout.lockstep import LockStep, OnResult
 from ugr_lightning.rollout.progress import Progress
 from ugr_lightning.rollout.stage import Order, Reply, Stage
-from ugr_lightning.rollout.workers import Worker, WorkerLostError, open_simulator, start_all
+from ugr_lightning.rollout.workers import Worker, WorkerLostError, open_simulator, start_all, wait_for_any
+
+SLOTS_PER_WORKER = 2
+"""Two episodes per process: four rows of a query take half the time per row of one."""
 
 
 class Runner:
     """Simulators that stay alive over many runs; a context manager.
 
     In every control step all slots move together: one query for the slots that need a chunk, then one step of every
-    simulator. Free slots take the next seed in slot order. What happens therefore depends on the seeds and on the
-    number of slots, never on how fast a process was.
+    simulator. Free slots take the next seed in slot order. What happens depends on the seeds alone: not on the number
+    of processes and slots (`PolicyActor` sees to that), and not on how fast a process was.
 
     Args:
         task: a name from `ugr tasks`.
@@ -42,7 +45,7 @@ class Runner:
         image_size: tuple[int, int] = (120, 160),
         render: bool = True,
         workers: int = 2,
-        slots_per_worker: int = 1,
+        slots_per_worker: int = SLOTS_PER_WORKER,
         timeout_s: float = 120.0,
         simulator: Callable[..., Any] | None = None,
     ) -> None:
@@ -114,41 +117,91 @@ class Runner:
         finally:
             actor.end()
 
-    def advance(self, orders: dict[int, Order]) -> tuple[dict[int, Reply], dict[int, str]]:
+    def advance(self, orders: dict[int, Order]) -> tuple[dict[int, Reply], dict[int, str | None]]:
         """Move slots on by one control step, all processes at the same time.
 
         Args:
             orders: by slot of the runner.
 
         Returns:
-            replies by slot, and by slot why the process behind it was lost; that one has been replaced.
+            replies by slot; and by slot what was lost with a process, which has been replaced. A process carries out
+            one order after the other, so its first slot without a reply is to blame and gets the reason; the other
+            slots get None and can begin their episodes anew.
         """
-        replies: dict[int, Reply] = {}
-        lost: dict[int, str] = {}
-        asked: dict[int, dict[int, Order]] = {}
-        for slot, order in orders.items():
-            asked.setdefault(slot // self._slots_per_worker, {})[slot % self._slots_per_worker] = order
+        asked: dict[int, list[int]] = {}
+        for slot in sorted(orders):
+            asked.setdefault(slot // self._slots_per_worker, []).append(slot)
         faults: dict[int, str] = {}
-        for index, jobs in asked.items():
+        for index, slots in asked.items():
             try:
-                self._workers[index].send("advance", [order._replace(slot=slot) for slot, order in jobs.items()])
+                for slot in slots:
+                    order = orders[slot]._replace(slot=slot % self._slots_per_worker)
+                    self._workers[index].send("advance", order)
             except WorkerLostError as error:
                 faults[index] = str(error)
-        deadline = time.monotonic() + self.timeout_s
-        for index in asked.keys() - faults.keys():
-            try:
-                for reply in self._workers[index].receive(max(0.0, deadline - time.monotonic())):
-                    replies[index * self._slots_per_worker + reply.slot] = reply
-            except WorkerLostError as error:
-                faults[index] = str(error)
+        replies = self._receive({index: deque(slots) for index, slots in asked.items() if index not in faults}, faults)
+        lost: dict[int, str | None] = {}
         for index, fault in faults.items():
-            lost |= {index * self._slots_per_worker + slot: fault for slot in asked[index]}
+            guilty = next((slot for slot in asked[index] if slot not in replies), asked[index][0])
+            for slot in asked[index]:
+                replies.pop(slot, None)  # its simulator is gone as well
+                lost[slot] = fault if slot == guilty else None
         start_all([self._workers[index] for index in faults])
         return replies, lost
 
+    def _receive(self, pending: dict[int, deque[int]], faults: dict[int, str]) -> dict[int, Reply]:
+        """Replies by slot, in whatever order they come; says in `faults` why a process was lost.
+
+        Args:
+            pending: by process the slots that it will reply for, in order.
+            faults: by process.
+        """
+        replies: dict[int, Reply] = {}
+        while pending:
+            indices = {self._workers[index]: index for index in pending}
+            ready = wait_for_any(list(indices), self.timeout_s)
+            for worker, index in indices.items():
+                try:
+                    if worker in ready:
+                        replies[pending[index].popleft()] = worker.receive()
+                    elif not ready:
+                        raise worker.hung(self.timeout_s)
+                except WorkerLostError as error:
+                    faults[index] = str(error)
+                if index in faults or not pending[index]:
+                    del pending[index]
+        return replies
+
     def _clear(self) -> None:
         """Restart processes that a run before left in the middle of a call."""
-        start_all([worker for worker in self._workers if worker.pid is None or worker.busy])
+        start_all([worker for worker in self._workers if worker.pid is None or worker.outstanding])
+
+
+class Runners:
+    """Simulators that stay open for the next call of `run_episodes`; a context manager."""
+
+    def __init__(self) -> None:
+        self._opened: dict[tuple[Any, ...], Runner] = {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def open(self, task: str, **settings: Any) -> Runner:
+        """A runner with these settings, which are those of `Runner`: the one of an earlier call, or a new one."""
+        key = (task, *sorted(settings.items()))
+        if key not in self._opened:
+            self._opened[key] = Runner(task, **settings).__enter__()
+        return self._opened[key]
+
+    def close(self) -> None:
+        """End all processes."""
+        while self._opened:
+            self._opened.popitem()[1].close()
 
 
 def run_episodes(
@@ -160,7 +213,7 @@ def run_episodes(
     image_size: tuple[int, int] = (120, 160),
     execution: str | int = "aggregate",
     workers: int = 2,
-    slots_per_worker: int = 1,
+    slots_per_worker: int = SLOTS_PER_WORKER,
     checkpoint: str | None = None,
     seeds_hash: str | None = None,
     on_result: OnResult | None = None,
@@ -169,6 +222,7 @@ def run_episodes(
     timeout_s: float = 120.0,
     progress: bool = True,
     simulator: Callable[..., Any] | None = None,
+    keep: Runners | None = None,
 ) -> list[EpisodeResult]:
     """Run one episode per seed and say how each ended.
 
@@ -192,6 +246,7 @@ def run_episodes(
         timeout_s: a process that takes longer for one control step counts as hung.
         progress: whether to show a progress line.
         simulator: what to open in place of `sim.Simulator`.
+        keep: where simulators of earlier calls are, and where those of this one stay; None ends them.
 
     Returns:
         Results in the order of the seeds.
@@ -203,16 +258,18 @@ def run_episodes(
     Source: DESIGN 4, 8; FACTS 6.
     """
     actor = make_actor(actor)
-    with Runner(
-        task,
-        setting=setting,
-        image_size=image_size,
-        render=bool(actor.cameras) or video_dir is not None,
-        workers=workers,  # also for few seeds: the size of the policy's batch is part of its arithmetic
-        slots_per_worker=slots_per_worker,
-        timeout_s=timeout_s,
-        simulator=simulator,
-    ) as runner:
+    runners = Runners() if keep is None else keep
+    try:
+        runner = runners.open(
+            task,
+            setting=setting,
+            image_size=tuple(image_size),
+            render=bool(actor.cameras) or video_dir is not None,
+            workers=workers,
+            slots_per_worker=slots_per_worker,
+            timeout_s=timeout_s,
+            simulator=simulator,
+        )
         return runner.run(
             actor,
             seeds,
@@ -224,3 +281,6 @@ def run_episodes(
             video_seeds=video_seeds,
             progress=progress,
         )
+    finally:
+        if keep is None:
+            runners.close()

@@ -16,11 +16,13 @@ class Order(NamedTuple):
         slot: slot of the worker, from 0.
         seed: start the episode of this seed; None goes on with the running one.
         action: (14,) command to execute; None leaves the command to the expert.
+        look: whether somebody will look at the pictures of the frame.
     """
 
     slot: int
     seed: int | None = None
     action: np.ndarray | None = None
+    look: bool = True
 
 
 class Reply(NamedTuple):
@@ -56,11 +58,8 @@ class Stage:
         self._simulators = [open_task() for _ in range(slots)]
         self._experts: list[Iterator[Any] | None] = [None] * slots
 
-    def advance(self, orders: list[Order]) -> list[Reply]:
-        """Carry out the orders, one per slot at most; a slot that fails does not harm the others."""
-        return [self._carry_out(order) for order in orders]
-
-    def _carry_out(self, order: Order) -> Reply:
+    def advance(self, order: Order) -> Reply:
+        """Carry out an order; a slot that fails does not harm the others."""
         start, slot = time.perf_counter(), order.slot
         frame, crash = None, None
         horizon, control_hz = int(self._simulators[slot].horizon), float(self._simulators[slot].control_hz)
@@ -75,11 +74,11 @@ class Stage:
         simulator = self._simulators[order.slot]
         if order.seed is not None:
             self._experts[order.slot] = None
-            return simulator.reset(order.seed)
+            return simulator.reset(order.seed, look=order.look)
         if order.action is not None:
-            return simulator.step(order.action)
+            return simulator.step(order.action, look=order.look)
         expert = self._experts[order.slot]
         if expert is None:
             expert = self._experts[order.slot] = simulator.expert()
         intention = next(expert, None)
-        return None if intention is None else simulator.step(intention.action)
+        return None if intention is None else simulator.step(intention.action, look=order.look)

@@ -20,7 +20,7 @@ from typing import Any, Self
 from ugr_lightning.errors import SimulationError, UGRError
 
 START_TIMEOUT_S = 300.0
-"""Imports and shader compilation take about ten seconds on a free machine; far longer on a crowded one."""
+"""Imports and the first picture take about five seconds on a free machine; far longer on a crowded one."""
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Without it a simulator's small tensor operations spend 20 ms a step on waking threads (SIM_NOTES)."""
@@ -31,7 +31,7 @@ class WorkerLostError(Exception):
 
 
 class Worker:
-    """A process with one object in it; a context manager. One call at a time.
+    """A process with one object in it; a context manager. It answers calls in the order in which they were sent.
 
     Args:
         build: called in the process to make the object; must be importable there (a module-level class or function,
@@ -44,8 +44,8 @@ class Worker:
         self._build = pickle.dumps(build)
         self._process: subprocess.Popen[bytes] | None = None
         self._connection: connection.Connection | None = None
-        self.busy = False
-        """Whether an answer is outstanding."""
+        self.outstanding = 0
+        """Calls that have not been answered."""
 
     def __enter__(self) -> Self:
         self.launch()
@@ -76,19 +76,19 @@ class Worker:
             process_group=0,  # Ctrl-C reaches the parent only, which ends its workers in order
         )
         theirs.close()
-        self._connection, self.busy = ours, True
+        self._connection, self.outstanding = ours, 1
         ours.send_bytes(self._build)
 
     def send(self, method: str, *args: Any) -> None:
         """Call a method of the object, without waiting for it."""
         try:
             self._open().send((method, args))
-            self.busy = True
+            self.outstanding += 1
         except OSError as error:
             raise self._lost() from error
 
     def receive(self, timeout_s: float = START_TIMEOUT_S) -> Any:
-        """The return value of the last call, or None as the first reply after a launch.
+        """The return value of the oldest call without one, or None as the first reply after a launch.
 
         Raises:
             WorkerLostError: the process has died, or did not answer in time and was killed.
@@ -97,15 +97,19 @@ class Worker:
         link = self._open()
         try:
             if not link.poll(timeout_s):
-                self.kill()
-                raise WorkerLostError(f"{self.name} did not answer within {timeout_s:.0f} s and was killed")
+                raise self.hung(timeout_s)
             value, error = link.recv()
-            self.busy = False
+            self.outstanding -= 1
         except (OSError, EOFError) as failure:
             raise self._lost() from failure
         if error is not None:
             raise error
         return value
+
+    def hung(self, timeout_s: float) -> WorkerLostError:
+        """Kill the process because it has not answered in time; returns the error that says so."""
+        self.kill()
+        return WorkerLostError(f"{self.name} did not answer within {timeout_s:.0f} s and was killed")
 
     def kill(self) -> None:
         """End the process at once and reap it; files that it writes appear by rename, so none is left half-written."""
@@ -204,7 +208,7 @@ def _end_with_parent(parent: int) -> None:
 
 
 def open_simulator(simulator: Callable[..., Any] | None, task: str, **settings: Any) -> Any:
-    """Open a simulator in this process and show it one scene: the first picture compiles shaders for seconds.
+    """Open a simulator in this process and show it one scene: the first picture of a process compiles shaders.
 
     Args:
         simulator: what to call in place of `sim.Simulator`, or None.
