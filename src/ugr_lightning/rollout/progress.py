@@ -81,10 +81,11 @@ class Progress:
         new = self._done - self._already
         elapsed = now - self._start
         left = elapsed / new * (self._total - self._done) if new else 0.0
-        line = f"{self._title}: {self._done}/{self._total}, {_clock(elapsed)} elapsed, {_clock(left)} left"
+        line = f"{self._title}: {self._done}/{self._total}, {clock(elapsed)} elapsed, {clock(left)} left"
         return f"{line}, {self._note}" if self._note else line
 
 
-def _clock(seconds: float) -> str:
+def clock(seconds: float) -> str:
+    """A time span as `m:ss` or `h:mm:ss`."""
     minutes, seconds = divmod(round(seconds), 60)
     return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}" if minutes >= 60 else f"{minutes}:{seconds:02d}"

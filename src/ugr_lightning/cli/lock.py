@@ -1,0 +1,80 @@
+"""A folder that one process writes at a time; the lock goes when its last holder does, however that ends."""
+
+import fcntl
+import json
+import os
+import platform
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+from ugr_lightning.errors import ConfigError
+
+
+class Lock:
+    """A lock that is held; `file` may be handed on to a child, which then holds it as well.
+
+    Args:
+        file: the locked file.
+    """
+
+    def __init__(self, file: IO[str]) -> None:
+        self.file = file
+
+    def describe(self, **facts: Any) -> None:
+        """Write down who holds the lock, for those who want it."""
+        self.file.seek(0)
+        self.file.truncate()
+        json.dump({"pid": os.getpid(), "host": platform.node(), **facts}, self.file)
+        self.file.flush()
+
+
+@contextmanager
+def locked(path: Path, what: str, *, shared: bool = False) -> Iterator[Lock]:
+    """Hold a lock; a crash releases it, so that a lock without a living holder is simply taken over.
+
+    Args:
+        path: the lock's file, which stays.
+        what: what the lock protects, for the error.
+        shared: let others that also share in; keeps out those who want it alone.
+
+    Raises:
+        ConfigError: another process holds it; names the process.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with path.open("a+") as file:
+        try:
+            fcntl.flock(file, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            raise _taken(path, what) from None
+        lock = Lock(file)
+        lock.describe()
+        yield lock
+
+
+def _taken(path: Path, what: str) -> ConfigError:
+    try:
+        holder = json.loads(path.read_text())
+    except ValueError:  # it is being written in this moment
+        holder = {}
+    here = holder.get("host") == platform.node()
+    pid = holder.get("pid")
+    if here and not _alive(pid) and "child" in holder:
+        pid = holder["child"]
+        got = f"process {pid}, which a benchmark that was killed has left at work"
+    else:
+        got = f"process {pid} on {holder.get('host')}"
+    fix = f"Wait until it ends, or end it (`kill {pid}`) and start again; nothing is lost but its last minutes."
+    return ConfigError(what, "a folder that nobody else writes", got, fix)
+
+
+def _alive(pid: Any) -> bool:
+    return isinstance(pid, int) and Path(f"/proc/{pid}").exists() and not _is_zombie(pid)
+
+
+def _is_zombie(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except (OSError, IndexError):
+        return True
