@@ -1,4 +1,5 @@
 import csv
+import warnings
 
 import pytest
 import torch
@@ -6,7 +7,7 @@ from lightning.pytorch import Trainer
 from tiny import TinyData, TinyPolicy, TinySamples, collate, train
 
 from ugr_lightning.errors import NumericsError
-from ugr_lightning.training.module import PolicyModule
+from ugr_lightning.training.module import PolicyModule, found_by
 
 QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
 
@@ -29,7 +30,13 @@ def test_every_loss_term_and_score_is_logged(run):
         "val/loss",
         "val/action_error",
     }
-    expected |= {"val/first_frame_error", "val/coarse_error", "val/refined_error", "val/spearman"}
+    expected |= {
+        "val/first_frame_error",
+        "val/coarse_error",
+        "val/refined_error",
+        "val/spearman",
+        "val/selector_recall",
+    }
     expected |= {"val/coarse_error_inside_mask", "val/error_inside_mask", "val/error_outside_mask"}
     assert expected <= logged
 
@@ -82,3 +89,18 @@ def test_schedule_warms_up_and_ends_at_a_hundredth():
     factors = [module.learning_rate_factor(step, 110) for step in (0, 9, 10, 60, 110)]
     assert factors == pytest.approx([0.1, 1.0, 1.0, 0.505, 0.01])
     assert PolicyModule(TinyPolicy()).learning_rate_factor(10**6, 0) == 1.0
+
+
+def test_recall_is_the_share_of_the_worst_valid_steps_that_were_chosen():
+    error = torch.tensor([[5.0, 4, 3, 2, 1], [1, 2, 9, 9, 9], [1, 2, 3, 4, 5]])
+    valid = torch.tensor([[True] * 5, [True, True, False, False, False], [True] * 5])
+    refined = torch.tensor([[True, False, True, False, False], [False, True, True, False, False], [False] * 5])
+    found, chosen = found_by(refined, error, valid)
+    assert found.tolist() == [0.5, 1, 0]
+    assert chosen.tolist() == [2, 1, 0]
+
+
+def test_a_module_is_made_without_warnings():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        PolicyModule(TinyPolicy())

@@ -229,8 +229,9 @@ def table(rows: list[Row]) -> list[tuple[str, ...]]:
 
 def event_table(events: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
     """Error and predicted deviation near events over those elsewhere, as cells, heading first."""
-    heading = ("event", "count", f"error within {NEAR} steps / elsewhere", "predicted deviation, likewise")
-    cells = [heading]
+    cells: list[tuple[str, ...]] = [
+        ("event", "count", f"error within {NEAR} steps / elsewhere", "predicted deviation, likewise")
+    ]
     for kind, of in events.items():
         cells.append((kind, str(of["count"]), _cell(of["error_near"]), _cell(of["deviation_near"])))
     return cells

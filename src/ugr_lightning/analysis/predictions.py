@@ -1,12 +1,11 @@
 """What a trained policy predicts on the demonstrations it was, and was not, trained on."""
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from ugr_lightning.contract import Chunk, ChunkPolicy, Observation
+from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.errors import DataError
 
@@ -32,10 +31,6 @@ class Predictions(NamedTuple):
     episode: np.ndarray
     step: np.ndarray
 
-    def rows(self, index: np.ndarray) -> "Predictions":
-        """Some of the chunks."""
-        return Predictions(*(None if values is None else values[index] for values in self))
-
 
 def predict(
     policy: ChunkPolicy,
@@ -44,7 +39,6 @@ def predict(
     *,
     stride: int = 5,
     batch_size: int = 16,
-    with_chunk: Callable[[Observation, Chunk], None] | None = None,
 ) -> Predictions:
     """Query a policy on every `stride`-th step of some episodes.
 
@@ -54,7 +48,6 @@ def predict(
         episodes: positions of the episodes.
         stride: control steps between two queries.
         batch_size: queries at once.
-        with_chunk: called with each batch's observation and chunk.
 
     Returns:
         Predictions in the order of episode and step.
@@ -81,10 +74,9 @@ def predict(
                 "step": batch.step.numpy(),
             }
         )
-        if with_chunk is not None:
-            with_chunk(batch.observation, chunk)
-    columns = {name: [part[name] for part in parts] for name in Predictions._fields}
-    return Predictions(**{name: None if found[0] is None else np.concatenate(found) for name, found in columns.items()})
+    columns: dict[str, list[Any]] = {name: [part[name] for part in parts] for name in Predictions._fields}
+    whole: dict[str, Any] = {name: None if of[0] is None else np.concatenate(of) for name, of in columns.items()}
+    return Predictions(**whole)
 
 
 def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end: str | None = None) -> ChunkDataModule:

@@ -3,6 +3,7 @@
 import json
 import math
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -177,9 +178,13 @@ def _write(
     title = f"# Uncertainty of {content['checkpoint']['file']}"
     parts = [title, *sentences, *map(as_markdown, tables), *(f"![{name}]({name}.png)" for name in figures)]
     for name, written in (("analysis.json", text), ("prior.json", prior), ("analysis.md", "\n\n".join(parts))):
-        publish(folder / name, lambda partial, written=written: partial.write_text(written + "\n") and None)
+        publish(folder / name, partial(_write_text, written + "\n"))
     for name, figure in figures.items():
-        publish(folder / f"{name}.png", lambda partial, figure=figure: figure.savefig(partial, format="png", dpi=120))
+        publish(folder / f"{name}.png", partial(figure.savefig, format="png", dpi=120))
+
+
+def _write_text(text: str, path: Path) -> None:
+    path.write_text(text)
 
 
 def _plain(value: Any) -> Any:

@@ -1,6 +1,7 @@
 """Trains anything that speaks ChunkPolicy: steps, optimiser, logging. The mathematics is the policy's own."""
 
 import math
+import warnings
 from pathlib import Path
 from typing import Any, Literal
 
@@ -104,6 +105,8 @@ class PolicyModule(LightningModule):
             self._mean("coarse_error_inside_mask", coarse, valid & chunk.refined)
             self._mean("error_inside_mask", error, valid & chunk.refined)
             self._mean("error_outside_mask", error, valid & ~chunk.refined)
+            found, chosen = found_by(chunk.refined, coarse, valid)
+            self._mean("selector_recall", found, chosen > 0)
         if chunk.log_variance is not None:
             # the head is trained on the error of the coarse actions (paper, uncertainty loss)
             self._metric("spearman").update(chunk.log_variance[valid].float(), coarse[valid])
@@ -171,7 +174,27 @@ class PolicyModule(LightningModule):
         )
 
 
+def found_by(refined: Tensor, error: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Share of each chunk's worst steps that were chosen for refinement, against an oracle with the same budget.
+
+    Args:
+        refined: (B, K) bool.
+        error: (B, K) of the coarse actions.
+        valid: (B, K) bool, False on padded steps.
+
+    Returns:
+        (B,) shares, 0 where nothing was chosen, and (B,) how many steps were.
+    """
+    chosen = (refined & valid).sum(1)  # (B,)
+    rank = error.masked_fill(~valid, -torch.inf).argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # (B, K)
+    worst = (rank < chosen[:, None]) & valid  # (B, K)
+    return (worst & refined).sum(1) / chosen.clamp(min=1), chosen
+
+
 def _scores() -> dict[str, Metric]:
     means = ["action_error", "first_frame_error", "coarse_error", "refined_error"]
-    means += ["coarse_error_inside_mask", "error_inside_mask", "error_outside_mask"]
-    return {name: MeanMetric(nan_strategy="disable") for name in means} | {"spearman": SpearmanCorrCoef()}
+    means += ["coarse_error_inside_mask", "error_inside_mask", "error_outside_mask", "selector_recall"]
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*will save all targets")  # one validation is small
+        spearman = SpearmanCorrCoef()
+    return {name: MeanMetric(nan_strategy="disable") for name in means} | {"spearman": spearman}
