@@ -4,10 +4,11 @@ from ugr_lightning.contract import EpisodeResult
 
 
 def test_demo_trains_evaluates_and_ends_with_a_table(tiny_config, monkeypatch, capsys):
-    asked = []
+    asked, kept = [], set()
 
     def roll_out(policy, task, *, seeds, episodes, execution, **options):
         asked.append((policy.rpartition("/")[2], task, seeds, episodes, str(execution)))
+        kept.add(options["keep"])
         name = policy if policy in ("zero", "expert") else "TinyPolicy"
         return [EpisodeResult(task, "demo_clean", 100000, "h", name, None, str(execution), name == "expert", 5)]
 
@@ -18,6 +19,7 @@ def test_demo_trains_evaluates_and_ends_with_a_table(tiny_config, monkeypatch, c
         ("policy_best.ckpt", "click_alarmclock", "evaluation", 12, "aggregate"),
         ("policy_best.ckpt", "click_alarmclock", "evaluation", 12, "25"),
     ]
+    assert len(kept) == 1, "all rollouts share their simulators"
     out = capsys.readouterr().out
     assert "tensorboard --logdir runs" in out
     assert "TinyPolicy" in out

@@ -73,6 +73,7 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
     assert [call["execution"] for call in world] == ["aggregate", 25]
     assert all(call["seeds"][0] >= 100000 and call["image_size"] == (8, 12) for call in world)
     assert world[0]["checkpoint"] is not None
+    assert world[0]["keep"] is world[1]["keep"] is not None, "both modes run in the same simulators"
     assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
 
 
@@ -117,3 +118,10 @@ def test_a_test_that_goes_on_runs_only_the_missing_episodes(world, tiny_config, 
     assert main(["test", "--episodes", "5", "--out", str(out), "--resume"]) == 0
     assert world == []
     assert "/5" in capsys.readouterr().out
+
+
+def test_rollout_hands_the_setting_on_and_clean_is_the_default(world):
+    command = ["rollout", "--policy", "zero", "--task", "click_alarmclock", "--episodes", "1"]
+    assert main([*command, "--setting", "demo_randomized"]) == 0
+    assert main(command) == 0
+    assert [call["setting"] for call in world] == ["demo_randomized", "demo_clean"]

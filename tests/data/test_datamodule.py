@@ -72,6 +72,13 @@ def test_the_split_names_episodes_and_seeds_in_plain_containers(recording_root):
     }
 
 
+def test_after_setup_the_size_of_the_pictures_is_known_whether_it_was_given_or_not(recording_root):
+    data = _ready(recording_root)
+    assert data.image_size == data.demonstrations[0].image_size
+    assert data.train_dataloader().dataset[0].images.shape[-2:] == data.image_size
+    assert _ready(recording_root, image_size=(8, 8)).image_size == (8, 8)
+
+
 def test_missing_episodes_are_recorded(tmp_path, record):
     data = _data(tmp_path, task="handover_block")
     asked = []

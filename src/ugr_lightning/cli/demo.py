@@ -36,6 +36,7 @@ def _demo(
     from ugr_lightning.cli.rollout import roll_out
     from ugr_lightning.cli.runs import resolve_checkpoint, versions_of
     from ugr_lightning.rollout.results import success_table
+    from ugr_lightning.rollout.runner import Runners
 
     missing = [path for path in config if not Path(path).is_file()]
     if missing:
@@ -47,23 +48,25 @@ def _demo(
     checkpoint = resolve_checkpoint("best", str(versions_of(Path(root) / run)[-1]), Path(root))
     folder, task = checkpoint.parent, _task_of(checkpoint)
     results = []
-    for policy, execution in (
-        ("zero", "aggregate"),
-        ("expert", "aggregate"),
-        (str(checkpoint), "aggregate"),
-        (str(checkpoint), 25),
-    ):
-        few = min(episodes, 10) if policy in ("zero", "expert") else episodes
-        results += roll_out(
-            policy,
-            task,
-            seeds="evaluation",
-            episodes=few,
-            execution=execution,
-            workers=workers,
-            video=folder / "episode.gif" if execution == "aggregate" and policy not in ("zero", "expert") else None,
-            out=folder / "evaluation.jsonl",
-        )
+    with Runners() as simulators:
+        for policy, execution in (
+            ("zero", "aggregate"),
+            ("expert", "aggregate"),
+            (str(checkpoint), "aggregate"),
+            (str(checkpoint), 25),
+        ):
+            few = min(episodes, 10) if policy in ("zero", "expert") else episodes
+            results += roll_out(
+                policy,
+                task,
+                seeds="evaluation",
+                episodes=few,
+                execution=execution,
+                workers=workers,
+                video=folder / "episode.gif" if execution == "aggregate" and policy not in ("zero", "expert") else None,
+                out=folder / "evaluation.jsonl",
+                keep=simulators,
+            )
     print(f"\n{success_table(results)}\n")
     print(f"{(time.monotonic() - began) / 60:.1f} minutes; checkpoint {checkpoint}, episode {folder / 'episode.gif'}")
     print(f"Watch the training:  tensorboard --logdir {root}")

@@ -185,7 +185,6 @@ def run(command: str, argv: Sequence[str]) -> int:
     warnings.filterwarnings(
         "ignore", message=".*exists and is not empty.*"
     )  # the log of a resumed run; it is continued
-    warnings.filterwarnings("ignore", message=".*will save all targets and predictions in the buffer.*")
     warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     torch.set_num_threads(

@@ -2,12 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from ugr_lightning.cli.call import call
 from ugr_lightning.cli.runs import resolve_checkpoint
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
+
+if TYPE_CHECKING:
+    from ugr_lightning.rollout.runner import Runners
 
 ExecutionName = Literal["aggregate", "aggregate-variance"] | int
 
@@ -82,8 +85,12 @@ def roll_out(
     traces: Path | None = None,
     refine_ratio: float | None = None,
     resume: bool = False,
+    keep: "Runners | None" = None,
 ) -> list[EpisodeResult]:
-    """Roll out a dummy or a checkpoint; see `ugr rollout`. With `resume`, only the seeds that `out` lacks.
+    """Roll out a dummy or a checkpoint; see `ugr rollout`.
+
+    With `resume`, only the seeds that `out` lacks. With `keep`, in simulators that earlier calls have started, and
+    those of this one stay.
 
     Raises:
         ConfigError: no task is given and the policy does not name one.
@@ -135,7 +142,7 @@ def roll_out(
     if not left:
         return [done[seed] for seed in wanted]
 
-    def keep(result: EpisodeResult, trace: EpisodeTrace) -> None:
+    def write(result: EpisodeResult, trace: EpisodeTrace) -> None:
         if out is not None:
             append_result(out, result)
         if traces is not None:
@@ -152,9 +159,10 @@ def roll_out(
             workers=min(workers, len(wanted)),
             checkpoint=sha,
             seeds_hash=seeds_hash(whole),
-            on_result=keep,
+            on_result=write,
             video_dir=scratch if video is not None else None,
             video_seeds=left[:1],
+            keep=keep,
         )
         if video is not None and results[0].video is not None:
             video.parent.mkdir(parents=True, exist_ok=True)
@@ -231,24 +239,27 @@ def _test(
         resume: run only the episodes that the results file lacks.
     """
     from ugr_lightning.rollout.results import success_table
+    from ugr_lightning.rollout.runner import Runners
 
     checkpoint = resolve_checkpoint(ckpt_path, run or newest_run(Path(root)), Path(root))
     print(f"checkpoint: {checkpoint}")
     results = []
-    for execution in executions:
-        file = Path(out) if out else checkpoint.with_name("evaluation.jsonl")
-        results += roll_out(
-            str(checkpoint),
-            task,
-            seeds="evaluation",
-            episodes=episodes,
-            execution=execution,
-            workers=workers,
-            out=file,
-            traces=None if traces is None else Path(traces),
-            refine_ratio=refine_ratio,
-            resume=resume,
-        )
+    with Runners() as simulators:
+        for execution in executions:
+            file = Path(out) if out else checkpoint.with_name("evaluation.jsonl")
+            results += roll_out(
+                str(checkpoint),
+                task,
+                seeds="evaluation",
+                episodes=episodes,
+                execution=execution,
+                workers=workers,
+                out=file,
+                traces=None if traces is None else Path(traces),
+                refine_ratio=refine_ratio,
+                resume=resume,
+                keep=simulators,
+            )
     print(success_table(results))
     return 0
 

@@ -48,7 +48,8 @@ DEFAULT_RECORDING = Recording()
 class ChunkDataModule(lightning.LightningDataModule):
     """Action chunks from demonstrations of one task.
 
-    After `setup`: `data` (`ChunkDataset` over all episodes), `episode_split`, `split` and `statistics`.
+    After `setup`: `data` (`ChunkDataset` over all episodes), `episode_split`, `split` and `statistics`; `image_size`
+    then is the size of the pictures, also where it was null.
 
     Args:
         task: task name.
@@ -139,6 +140,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.episode_split: Split = split_episodes(len(episodes), self.split_seed)
         self.statistics: Statistics = compute_statistics(episodes, self.episode_split.train, state=self.state)
         store = open_frames(episodes, self.cache, self.image_size)
+        self.image_size = self.image_size or episodes[0].image_size
         conventions = (self.state, self.action_offset, self.after_end, self.observation_steps)
         self.data = ChunkDataset(episodes, store, self.chunk_length, *conventions)
         self.demonstrations = episodes

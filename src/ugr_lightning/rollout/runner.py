@@ -130,12 +130,12 @@ class Runner:
         """
         asked: dict[int, list[int]] = {}
         for slot in sorted(orders):
-            asked.setdefault(slot // self._slots_per_worker, []).append(slot)
+            asked.setdefault(slot % len(self._workers), []).append(slot)  # few episodes still occupy all processes
         faults: dict[int, str] = {}
         for index, slots in asked.items():
             try:
                 for slot in slots:
-                    order = orders[slot]._replace(slot=slot % self._slots_per_worker)
+                    order = orders[slot]._replace(slot=slot // len(self._workers))
                     self._workers[index].send("advance", order)
             except WorkerLostError as error:
                 faults[index] = str(error)

@@ -55,8 +55,6 @@ def describe(policy: ChunkPolicy, datamodule: LightningDataModule | None) -> dic
         datamodule: where its data come from; the names in `_DATA` that it has are stored.
     """
     data = {name: getattr(datamodule, name) for name in _DATA if hasattr(datamodule, name)}
-    if data.get("image_size", True) is None:  # the recorded size
-        data["image_size"] = datamodule.demonstrations[0].image_size  # type: ignore[union-attr]
     return {
         "format": FORMAT,
         "blueprint": policy.blueprint(),

@@ -1,8 +1,10 @@
 import io
 import json
+from contextlib import nullcontext
 
 import numpy as np
 import pytest
+from lightning.pytorch import Callback
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from tiny import train
@@ -10,6 +12,7 @@ from tiny import train
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import RenderError
 from ugr_lightning.rollout.lockstep import EpisodeTrace
+from ugr_lightning.rollout.runner import Runners
 from ugr_lightning.training.callbacks import rollout
 from ugr_lightning.training.callbacks.rollout import RolloutEvaluation
 
@@ -54,6 +57,23 @@ def test_rollouts_use_selection_seeds_and_log_rate_interval_video_and_uncertaint
     gif = events.Images("rollout/episode")[0].encoded_image_string
     assert Image.open(io.BytesIO(gif)).n_frames == 2
     assert "rollout/success_rate" in events.Tags()["scalars"]
+
+
+@pytest.mark.parametrize("fault", [None, ValueError("a fault in training")])
+def test_simulators_stay_for_the_whole_training_and_end_with_it(tmp_path, world, monkeypatch, fault):
+    class Late(Callback):
+        def on_train_batch_end(self, trainer, *_):
+            if fault is not None and trainer.global_step == 4:
+                raise fault
+
+    closed = []
+    monkeypatch.setattr(Runners, "close", lambda runners: closed.append((runners, len(world))))
+    callback = RolloutEvaluation(every_n_steps=1, episodes=1)
+    with nullcontext() if fault is None else pytest.raises(ValueError, match="a fault"):
+        train(tmp_path / "tiny" / "version_0", callbacks=[callback, Late()], max_steps=5)
+    kept = {call["keep"] for call in world}
+    assert len(kept) == 1
+    assert (kept.pop(), len(world)) == closed[-1]
 
 
 def test_rollouts_do_not_change_the_training(tmp_path, world):

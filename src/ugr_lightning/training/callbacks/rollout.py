@@ -14,7 +14,7 @@ from ugr_lightning.errors import ConfigError, RenderError
 from ugr_lightning.rollout.actors import PolicyActor
 from ugr_lightning.rollout.lockstep import EpisodeTrace
 from ugr_lightning.rollout.results import append_result, summarize
-from ugr_lightning.rollout.runner import run_episodes
+from ugr_lightning.rollout.runner import Runners, run_episodes
 from ugr_lightning.training.callbacks.averaging import averaged_weights
 from ugr_lightning.training.tensorboard import log_figure, log_image
 
@@ -22,7 +22,8 @@ from ugr_lightning.training.tensorboard import log_figure, log_image
 class RolloutEvaluation(Callback):
     """Lets the policy act in the simulator every so many steps and logs how often it succeeds.
 
-    The seeds start at 200000: recipe choices and checkpoints may look at them, the evaluation never does.
+    The seeds start at 200000: recipe choices and checkpoints may look at them, the evaluation never does. The
+    simulators start with the first rollout and stay until the training ends.
 
     Args:
         every_n_steps: optimiser steps between two rollouts; 0 for never.
@@ -53,6 +54,15 @@ class RolloutEvaluation(Callback):
         self.video = video
         self.on_missing_renderer = on_missing_renderer
         self._last_step = 0
+        self._simulators = Runners()
+
+    def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
+        """End the simulators."""
+        self._simulators.close()
+
+    def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
+        """End the simulators."""
+        self._simulators.close()
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Find out before the first step whether rollouts will be possible."""
@@ -128,13 +138,14 @@ class RolloutEvaluation(Callback):
             self.task,
             seeds,
             setting=data.setting,
-            image_size=data.image_size or data.demonstrations[0].image_size,
+            image_size=data.image_size,
             execution=self.execution,
             workers=self.workers,
             on_result=keep,
             video_dir=videos if self.video else None,
             video_seeds=seeds[:1],
             progress=False,
+            keep=self._simulators,
         )
         return results, uncertainty
 
