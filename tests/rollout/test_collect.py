@@ -188,3 +188,33 @@ def test_a_video_is_written_when_asked_for(tmp_path):
 def test_impossible_numbers_are_refused(tmp_path):
     with pytest.raises(ConfigError, match="0 episodes"):
         record(tmp_path, episodes=0)
+
+
+def test_a_recording_says_its_setting_and_a_folder_holds_one_setting(tmp_path):
+    record(tmp_path, episodes=1, setting="demo_randomized")
+    assert read_episode(episode_path(tmp_path, 0)).extras["setting"] == "demo_randomized"
+    assert json.loads((tmp_path / "recording.json").read_text())["setting"] == "demo_randomized"
+    with pytest.raises(DataError, match="got setting 'demo_randomized'"):
+        record(tmp_path, episodes=2, setting="demo_clean")
+
+
+def test_a_folder_of_another_version_of_the_task_is_not_added_to(tmp_path, monkeypatch):
+    monkeypatch.setattr("ugr_lightning.rollout.collect.task_names", lambda: ("reach",))
+    monkeypatch.setattr("ugr_lightning.rollout.collect.task_version", lambda task: 1)
+    record(tmp_path, episodes=1)
+    monkeypatch.setattr("ugr_lightning.rollout.collect.task_version", lambda task: 2)
+    with pytest.raises(DataError, match="a recording with task_version 2, got task_version 1"):
+        record(tmp_path, episodes=2)
+    path = tmp_path / "recording.json"
+    content = json.loads(path.read_text())
+    del content["task_version"]  # as older recordings are
+    path.write_text(json.dumps(content))
+    record(tmp_path, episodes=2)
+    assert read_seeds(tmp_path) == [0, 1]
+
+
+def test_a_wrong_task_or_setting_leaves_no_folder(tmp_path):
+    for wrong in ({"task": "click_alarm_clock"}, {"task": "click_alarmclock", "setting": "demo_dirty"}):
+        with pytest.raises(ConfigError, match="expected"):
+            record(tmp_path / "new", simulator=None, **wrong)
+    assert not (tmp_path / "new").exists()

@@ -25,7 +25,7 @@ def test_the_page_shows_a_gif_and_stills_of_every_task_in_every_setting(tmp_path
     assert "seed 4, 12 control steps" in text
     with Image.open(tmp_path / "reach-demo_clean.gif") as film:
         assert film.n_frames == 13
-        assert film.size == (480, 120)
+        assert film.size == (3 * 128, 96)
     with Image.open(tmp_path / "reach-demo_clean.jpg") as stills:
         assert stills.size == (3 * 32, 3 * 24)
     assert all((tmp_path / name).stat().st_size < GIF_BYTES for name in shown)
