@@ -20,7 +20,7 @@ def table2():
 
 def test_markdown_has_a_row_for_every_rate_and_comparison():
     text = to_markdown(table2(), "Table 2")
-    assert text.startswith("# Table 2\n\n## Conclusion\n\n**What may be concluded:**")
+    assert text.startswith("# Table 2\n\n## Conclusion\n\n**What may be concluded:**\n\n- `uncert` succeeds")
     rows = [line for line in text.splitlines() if line.startswith("| click")]
     assert len(rows) == 3 + 3
     assert all(len(re.split(r"(?<!\\)\|", row)) == len(re.split(r"(?<!\\)\|", rows[0])) for row in rows[:3])

@@ -8,16 +8,10 @@ import signal
 import sys
 from functools import partial
 
-import torch
-from fake_simulator import FakeSimulator
-from tiny import TinyPolicy
-
-from ugr_lightning.cli.main import main
-from ugr_lightning.rollout import results, runner
-from ugr_lightning.sim import render
-
 
 def kill_in_training(at):
+    from tiny import TinyPolicy
+
     losses, step = TinyPolicy.losses, [0]
 
     def counted(self, batch):
@@ -30,6 +24,8 @@ def kill_in_training(at):
 
 
 def kill_in_evaluation(at):
+    from ugr_lightning.rollout import results
+
     append, count = results.append_result, [0]
 
     def counted(path, result):
@@ -41,11 +37,25 @@ def kill_in_evaluation(at):
     results.append_result = counted
 
 
-if __name__ == "__main__":
+def pretend_to_simulate():
+    from fake_simulator import FakeSimulator
+
+    from ugr_lightning.rollout import runner
+    from ugr_lightning.sim import render
+
+    runner.run_episodes = partial(runner.run_episodes, simulator=FakeSimulator)
+    render.require_rendering = lambda: None
+
+
+if __name__ == "__main__":  # the simulator's processes import this file as well, and shall be quick
+    import torch
+
+    from ugr_lightning.cli.main import main
+
     torch.set_num_threads(1)
     part, _, number = os.environ.get("KILL", "").partition(":")
     if part == sys.argv[1]:
         {"fit": kill_in_training, "test": kill_in_evaluation}[part](int(number))
-    runner.run_episodes = partial(runner.run_episodes, simulator=FakeSimulator)
-    render.require_rendering = lambda: None
+    if sys.argv[1] == "test":
+        pretend_to_simulate()
     sys.exit(main(sys.argv[1:]))

@@ -1,7 +1,7 @@
 """`ugr fit` and `ugr test` as far as a benchmark sees them, without training; appends its arguments to CALLS.
 
-FAIL=WORD lets every call fail whose arguments contain the word; ORPHAN=FIFO kills the parent and waits until somebody
-writes into the FIFO.
+FAIL=WORD lets every call fail whose arguments contain the word; SIGKILL=FIFO and SIGTERM=FIFO send the parent this
+signal and wait until somebody writes into the FIFO.
 """
 
 import hashlib
@@ -16,9 +16,9 @@ command, *words = sys.argv[1:]
 options = dict(pairwise(words))
 with open(os.environ["CALLS"], "a") as calls:
     calls.write(json.dumps([command, *words]) + "\n")
-if "ORPHAN" in os.environ:
-    os.kill(os.getppid(), signal.SIGKILL)
-    Path(os.environ["ORPHAN"]).read_text()
+for name in {"SIGKILL", "SIGTERM"} & os.environ.keys():
+    os.kill(os.getppid(), signal.Signals[name])
+    Path(os.environ[name]).read_text()
 if os.environ.get("FAIL", "\0") in " ".join([command, *words]):
     print("it went wrong in this way")
     sys.exit(3)

@@ -94,12 +94,12 @@ def test_a_grid_is_killed_twice_and_goes_on_as_if_it_never_had_been(environment,
 def test_a_benchmark_that_was_killed_leaves_a_lock_only_as_long_as_its_job_lives(calls, monkeypatch, capsys):
     write_grid()
     os.mkfifo("fifo")
-    monkeypatch.setenv("ORPHAN", "fifo")
+    monkeypatch.setenv("SIGKILL", "fifo")
     killed = multiprocessing.get_context("fork").Process(target=go)
     killed.start()
     killed.join()
     assert killed.exitcode == -signal.SIGKILL
-    monkeypatch.delenv("ORPHAN")
+    monkeypatch.delenv("SIGKILL")
     orphan = json.loads(Path("out/benchmark.lock").read_text())["child"]
     capsys.readouterr()
     assert go() == 2
@@ -109,6 +109,17 @@ def test_a_benchmark_that_was_killed_leaves_a_lock_only_as_long_as_its_job_lives
     with open("out/benchmark.lock") as file:
         fcntl.flock(file, fcntl.LOCK_EX)  # until it is gone
     assert go() == 0, "a lock whose holder died is taken over"
+
+
+def test_ending_a_benchmark_ends_its_job(calls, monkeypatch, capsys):
+    write_grid()
+    os.mkfifo("fifo")
+    monkeypatch.setenv("SIGTERM", "fifo")
+    assert go() == 130
+    child = json.loads(Path("out/benchmark.lock").read_text())["child"]
+    assert not Path(f"/proc/{child}").exists()
+    monkeypatch.delenv("SIGTERM")
+    assert go() == 0
 
 
 def test_what_is_done_is_skipped_and_more_episodes_are_added(calls, capsys):

@@ -1,6 +1,6 @@
 """What may be concluded from a report and what may not, in words made from its numbers."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from ugr_lightning.analysis.power import LARGEST, paired_episodes
 from ugr_lightning.analysis.report import ALL_TASKS, Contest, Report
@@ -10,6 +10,7 @@ LEVEL = 0.05
 MARGIN = 0.10
 """Comparisons that leave room for a larger difference than this have too few episodes to say that there is none."""
 ENOUGH_TRAINING_SEEDS = 3
+MAY, MAY_NOT = "What may be concluded:", "What may not:"
 
 
 @dataclass(frozen=True)
@@ -25,8 +26,12 @@ class Conclusion:
     may_not: list[str]
 
     def __str__(self) -> str:
-        parts = (("What may be concluded:", self.may), ("What may not:", self.may_not))
-        return "\n\n".join(f"**{title}** {' '.join(sentences)}" for title, sentences in parts if sentences)
+        return "\n\n".join(f"**{title}**\n\n" + "\n".join(f"- {text}" for text in items) for title, items in self.parts)
+
+    @property
+    def parts(self) -> list[tuple[str, list[str]]]:
+        """Both parts under their titles, without one that is empty."""
+        return [(title, items) for title, items in ((MAY, self.may), (MAY_NOT, self.may_not)) if items]
 
 
 def conclude(report: Report) -> Conclusion:
@@ -60,9 +65,8 @@ def _is_close(contest: Contest) -> bool:
 
 def _verdict(contest: Contest) -> str:
     if _differs(contest):
-        better, worse = _ordered(contest)
-        found = f"`{better}` succeeds more often than `{worse}` {_where(contest)}"
-        return f"{found}: {_numbers(contest)}. {_again(contest)}"
+        won = _from_the_winner(contest)
+        return f"`{won.a}` succeeds more often than `{won.b}` {_where(won)}: {_numbers(won)}. {_again(won)}"
     if _is_close(contest):
         largest = max(-contest.low, contest.high)
         return (
@@ -76,9 +80,12 @@ def _verdict(contest: Contest) -> str:
     )
 
 
-def _ordered(contest: Contest) -> tuple[str, str]:
-    """The more successful policy first."""
-    return (contest.a, contest.b) if contest.difference > 0 else (contest.b, contest.a)
+def _from_the_winner(c: Contest) -> Contest:
+    """The same contest with the more successful policy first."""
+    if c.difference >= 0:
+        return c
+    swapped = {"a": c.b, "b": c.a, "rate_a": c.rate_b, "rate_b": c.rate_a, "only_a": c.only_b, "only_b": c.only_a}
+    return replace(c, **swapped, low=-c.high, high=-c.low)  # type: ignore[arg-type]
 
 
 def _where(contest: Contest) -> str:
@@ -132,7 +139,7 @@ def _single_tasks(contests: list[Contest]) -> list[str]:
     found = [c for c in contests if _differs(c)]
     if not found:
         return []
-    named = ["`{}` over `{}` {} (p = {:.3g})".format(*_ordered(c), _where(c), c.p_holm) for c in found]
+    named = [f"`{c.a}` over `{c.b}` {_where(c)} (p = {c.p_holm:.3g})" for c in map(_from_the_winner, found)]
     return [f"By themselves these tasks show a difference between the checkpoints: {'; '.join(named)}."]
 
 

@@ -39,12 +39,14 @@ class Section:
 
     Args:
         title: its heading.
-        paragraphs: Markdown with `code` and **bold** only.
+        lists: sentences under a heading each.
+        paragraphs: Markdown with `code` only, as in the sentences.
         table: head and rows, or empty.
         figure: an SVG drawing for the HTML page, or empty.
     """
 
     title: str
+    lists: list[tuple[str, list[str]]] = field(default_factory=list)
     paragraphs: list[str] = field(default_factory=list)
     table: list[Sequence[str]] = field(default_factory=list)
     figure: str = ""
@@ -68,6 +70,8 @@ def to_markdown(report: Report, title: str) -> str:
     parts = [f"# {title}"]
     for section in sections(report):
         parts.append(f"## {section.title}")
+        for heading, items in section.lists:
+            parts += [f"**{heading}**", "\n".join(f"- {item}" for item in items)]
         parts += section.paragraphs
         if section.table:
             head, *rows = section.table
@@ -81,6 +85,9 @@ def to_html(report: Report, title: str) -> str:
     parts = [f"<h1>{html.escape(title)}</h1>"]
     for section in sections(report, figures=True):
         parts.append(f"<h2>{html.escape(section.title)}</h2>")
+        for heading, items in section.lists:
+            points = "".join(f"<li>{_inline(item)}</li>" for item in items)
+            parts.append(f"<p><strong>{html.escape(heading)}</strong></p><ul>{points}</ul>")
         parts += [f"<p>{_inline(paragraph)}</p>" for paragraph in section.paragraphs]
         parts.append(section.figure)
         if section.table:
@@ -94,7 +101,7 @@ def to_html(report: Report, title: str) -> str:
 
 def sections(report: Report, figures: bool = False) -> list[Section]:
     """The report's parts in order: conclusion, rates by mode, comparisons by mode, method."""
-    found = [Section("Conclusion", [*str(conclude(report)).split("\n\n"), *report.remarks])]
+    found = [Section("Conclusion", conclude(report).parts, report.remarks)]
     for mode in dict.fromkeys(rate.mode for rate in report.rates):
         rates = [rate for rate in report.rates if rate.mode == mode]
         contests = [contest for contest in report.contests if contest.mode == mode]
@@ -104,7 +111,7 @@ def sections(report: Report, figures: bool = False) -> list[Section]:
         if contests:
             drawn = contests_figure(contests) if figures else ""
             found.append(Section(f"Comparisons: {place}", table=_contest_table(contests), figure=drawn))
-    found.append(Section("Method", [METHOD]))
+    found.append(Section("Method", paragraphs=[METHOD]))
     return found
 
 
@@ -211,10 +218,8 @@ def to_svg(figure: Figure, name: str) -> str:
 
 
 def _inline(text: str) -> str:
-    """`code` and **bold** of a paragraph as HTML, all else escaped."""
-    escaped = html.escape(text)
-    escaped = re.sub(r"`([^`]+)`", r"<code>\1</code>", escaped)
-    return re.sub(r"\*\*([^*]+)\*\*", r"<strong>\1</strong>", escaped)
+    """`code` of a sentence as HTML, all else escaped."""
+    return re.sub(r"`([^`]+)`", r"<code>\1</code>", html.escape(text))
 
 
 def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
