@@ -29,14 +29,14 @@ def test_a_clear_winner_over_training_seeds_is_one_between_trainings():
     runs = [drawn("base", 0.5, seed=t, training_seed=t) for t in range(4)]
     runs += [drawn("uncert", 0.9, seed=9 + t, training_seed=t) for t in range(4)]
     may, may_not = words(*runs)
-    assert "It holds over 4 training seeds" in may
+    assert "It holds over the 4 training seeds" in may
     assert "training" not in may_not
 
 
 def test_two_training_seeds_are_called_too_few():
     runs = [drawn(p, r, seed=t, training_seed=t) for p, r in (("base", 0.3), ("uncert", 0.9)) for t in range(2)]
     may, may_not = words(*runs)
-    assert "too few to know how much training again would vary" in may
+    assert "2 training seeds are too few to know how much training again would vary" in may
     assert "2 training seeds underestimate it" in may_not
 
 

@@ -118,8 +118,8 @@ def _again(contest: Contest) -> str:
     if contest.low <= 0 <= contest.high:
         return f"Over its {n} training seeds the difference varies so much that another training could show none."
     if n < ENOUGH_TRAINING_SEEDS:
-        return f"{n} training seeds agree, which are too few to know how much training again would vary."
-    return f"It holds over {n} training seeds."
+        return f"{n} training seeds are too few to know how much training again would vary."
+    return f"It holds over the {n} training seeds, in the sense of the interval."
 
 
 def _needed(contest: Contest) -> str:
