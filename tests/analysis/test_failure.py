@@ -49,7 +49,7 @@ def test_a_new_score_exceeds_the_conformal_threshold_as_rarely_as_asked():
 
 def test_the_maximum_runs_over_a_moving_average():
     scores = np.array([0.0, 3, 0, 0, 6, 6, 0])
-    assert running_maximum(scores, 2).tolist() == [1.5, 1.5, 1.5, 1.5, 3, 6, 6]
+    assert running_maximum(scores, 2).tolist() == [-np.inf, 1.5, 1.5, 1.5, 3, 6, 6]
     assert running_maximum(np.array([2.0]), 5).tolist() == [2]
 
 

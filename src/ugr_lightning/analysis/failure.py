@@ -68,10 +68,10 @@ def step_scores(trace: UncertaintyTrace, until: int, horizon: int = HORIZON) -> 
 
 
 def running_maximum(scores: np.ndarray, window: int = 5) -> np.ndarray:
-    """Highest moving average so far, (Q,): a single uncertain query is no alarm."""
+    """Highest average of `window` queries so far, (Q,), -inf before the first: a single uncertain query is no alarm."""
     width = min(window, len(scores))
     smooth = np.convolve(scores, np.ones(width) / width, mode="valid")  # (Q - width + 1,)
-    return np.maximum.accumulate(np.concatenate([np.full(width - 1, smooth[0]), smooth]))
+    return np.maximum.accumulate(np.concatenate([np.full(width - 1, -np.inf), smooth]))
 
 
 def conformal_threshold(scores: np.ndarray, level: float = 0.1) -> float:
