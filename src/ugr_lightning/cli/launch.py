@@ -43,8 +43,8 @@ def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str
     print(f"submitted {len(jobs)} jobs: {', '.join(job.job_id for job in jobs)}; logs in {folder}", flush=True)
     failed = []
     for job in jobs:
-        error = job.exception()
-        if error is not None or job.result() != 0:
+        fault = job.exception()
+        if fault is not None or job.result() != 0:
             failed.append(job.job_id)
     if failed:
         print(f"{len(failed)} of {len(jobs)} jobs failed: {', '.join(failed)}")

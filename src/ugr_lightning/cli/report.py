@@ -55,8 +55,8 @@ def _report(
     if out is None:
         print(to_markdown(report, title), end="")
     else:
-        for path in write_report(report, Path(out), title):
-            print(path)
+        for written in write_report(report, Path(out), title):
+            print(written)
     return 0
 
 
