@@ -20,7 +20,7 @@ class Squarer:
 
 
 def run(numbers, **more):
-    return {done.index: done for done in spread(Squarer, "square", numbers, **more)}
+    return {done.job: done for done in spread(Squarer, "square", numbers, **more)}
 
 
 def test_every_job_is_done_once_by_the_processes_that_there_are():

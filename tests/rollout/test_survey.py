@@ -53,6 +53,12 @@ def test_a_row_counts_successes_lengths_and_costs(row):
     assert 0 < row.recordings[0].megabytes < row.recordings[1].megabytes
 
 
+def test_dummies_and_recordings_can_be_left_out():
+    row = survey("reach", first_seed=0, **SMALL | {"dummy_episodes": 0, "recordings": 0, "episodes": 1})
+    assert (row.zero.n, row.random.n, row.recordings) == (0, 0, ())
+    assert row.expert.n == 1
+
+
 def test_rows_are_added_and_replaced_in_both_files(row, tmp_path):
     stem = tmp_path / "table"
     write_survey(stem, row)

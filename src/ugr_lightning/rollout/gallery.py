@@ -161,8 +161,8 @@ def make_gallery(
         for done in spread(build, "shoot", subjects, workers=workers):
             if done.fault is not None:
                 fix = "Run the command again."
-                raise SimulationError(", ".join(subjects[done.index]), "a simulator that works", done.fault, fix)
-            shots[done.index] = done.value
+                raise SimulationError(", ".join(subjects[done.job]), "a simulator that works", done.fault, fix)
+            shots[done.job] = done.value
             line.advance(done.value.gif)
     page = folder / "gallery.md"
     publish_text(page, _page([shots[index] for index in range(len(subjects))]))

@@ -102,9 +102,9 @@ def replay(
             open_task = partial(open_simulator, simulator, task, setting=setting, render=False)
             jobs = [recordings[i] for i in members]
             for done in spread(partial(Replayer, open_task), "replay", jobs, workers=workers):
-                job = jobs[done.index]
+                job = jobs[done.job]
                 lost = Replay(job.path, job.seed, len(job.actions), False, float("inf"), done.fault)
-                results[members[done.index]] = done.value or lost
+                results[members[done.job]] = done.value or lost
                 line.advance(f"{sum(item.success for item in results.values())} reproduced")
     return [results[index] for index in range(len(paths))]
 

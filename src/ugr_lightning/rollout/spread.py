@@ -12,12 +12,12 @@ class Done(NamedTuple):
     """A job that has ended.
 
     Args:
-        index: its place among the jobs.
+        job: its place among the jobs.
         value: what the method returned; None where the process was lost.
         fault: why the process was lost, or None.
     """
 
-    index: int
+    job: int
     value: Any
     fault: str | None = None
 

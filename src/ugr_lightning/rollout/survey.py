@@ -83,8 +83,8 @@ def perform(
     with Progress(f"{task}, {setting}: expert", len(seeds), shown=progress) as line:
         for done in spread(partial(Performer, open_task), "perform", seeds, workers=workers):
             if done.fault is not None:
-                line.message(f"Seed {seeds[done.index]} counts as a failure: {done.fault}")
-            results[done.index] = done.value or Performance(seeds[done.index], False, 0, "")
+                line.message(f"Seed {seeds[done.job]} counts as a failure: {done.fault}")
+            results[done.job] = done.value or Performance(seeds[done.job], False, 0, "")
             line.advance(f"{sum(item.success for item in results.values())} solved")
     return [results[index] for index in range(len(seeds))]
 
@@ -185,7 +185,7 @@ def survey(
     performances = perform(task, seeds, workers=workers, **shared)  # type: ignore[arg-type]
     dummies = {
         name: run_episodes(name, task, seeds[:dummy_episodes], workers=workers, **shared)  # type: ignore[arg-type]
-        for name in ("zero", "random")
+        for name in (("zero", "random") if dummy_episodes else ())
     }
     lengths = [item.steps for item in performances if item.success]
     return Survey(
@@ -194,8 +194,8 @@ def survey(
         task_version=task_version(task) if task in task_names() else None,
         first_seed=first_seed,
         expert=Rate.of([item.success for item in performances]),
-        zero=Rate.of([item.success for item in dummies["zero"]]),
-        random=Rate.of([item.success for item in dummies["random"]]),
+        zero=Rate.of([item.success for item in dummies.get("zero", [])]),
+        random=Rate.of([item.success for item in dummies.get("random", [])]),
         steps=(round(float(np.mean(lengths)), 1), min(lengths), max(lengths)) if lengths else (0.0, 0, 0),
         failures=tuple(item.seed for item in performances if not item.success),
         recordings=tuple(
