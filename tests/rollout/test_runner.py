@@ -13,7 +13,7 @@ from ugr_lightning.sim.seeds import seeds_hash
 SMALL = {"image_size": (24, 32), "progress": False, "simulator": FakeSimulator}
 SEEDS = [9, 0, 1, 2, 3, 4]
 PROBES = ROWS
-"""Queries that find out which sizes of a batch give the same bits, with four slots."""
+"""Queries that find out at which sizes of a batch the bits are the same."""
 
 
 def run(actor, seeds=SEEDS, task="reach", **more):
@@ -94,7 +94,7 @@ def test_where_rounding_depends_on_the_batch_all_queries_have_one_size_whatever_
         policy = Rounding()
         results = run(policy, workers=workers, slots_per_worker=slots)
         motions.append([result.motion_hash for result in results])
-        assert set(policy.batch_sizes[1 + min(workers * slots, ROWS - 1) :]) == {ROWS}
+        assert set(policy.batch_sizes[PROBES:]) == {ROWS}
     assert motions[0] == motions[1] == motions[2]
 
 
@@ -179,7 +179,7 @@ def test_a_policy_of_several_observations_sees_the_steps_just_before_also_those_
     policy.observation_steps = 3
     keep = {"on_result": lambda result, trace: traces.append(trace)}
     results = run(policy, seeds=[5, 6], workers=1, slots_per_worker=1, execution=4, **keep)
-    seen = iter(zip(policy.histories[2:], policy.pixels[2:], strict=True))  # without the two on noise
+    seen = iter(zip(policy.histories[PROBES:], policy.pixels[PROBES:], strict=True))
     for result, trace in zip(results, traces, strict=True):
         for step in range(0, result.steps, 4):
             past = [max(0, step - 2), max(0, step - 1), step]  # before the start: the first, never the last episode
@@ -276,3 +276,7 @@ def test_an_unknown_actor_or_execution_is_an_error(runner):
         make_actor("exprt")
     with pytest.raises(ConfigError, match="execution"):
         runner.run(Reacher(), [0], execution="aggregated", progress=False)
+
+
+def test_results_say_the_setting_that_the_episodes_ran_in():
+    assert [result.setting for result in run("zero", [1, 2], setting="demo_randomized")] == ["demo_randomized"] * 2
