@@ -1,6 +1,7 @@
 """`ugr tasks`: list, measure, verify and picture the simulated tasks."""
 
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ugr_lightning.cli.call import call
@@ -97,8 +98,9 @@ def _verify(tasks: Sequence[str], settings: Sequence[str], episodes: int, worker
 
     differing = 0
     for name in tasks:
-        checks = [verify_determinism(name, setting=each, episodes=episodes, workers=workers) for each in settings]
-        for check in [*checks, verify_evaluation_seeds(name, workers=workers)]:
-            print(check, flush=True)
-            differing += len(check.differing)
+        checks = [partial(verify_determinism, setting=each, episodes=episodes) for each in settings]
+        for check in (*checks, verify_evaluation_seeds):
+            found = check(name, workers=workers)
+            print(found, flush=True)
+            differing += len(found.differing)
     return 2 if differing else 0
