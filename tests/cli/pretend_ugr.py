@@ -17,6 +17,8 @@ options = dict(pairwise(words))
 with open(os.environ["CALLS"], "a") as calls:
     calls.write(json.dumps([command, *words]) + "\n")
 for name in {"SIGKILL", "SIGTERM"} & os.environ.keys():
+    while "child" not in Path("out/benchmark.lock").read_text():  # the parent may not have got so far yet
+        pass
     os.kill(os.getppid(), signal.Signals[name])
     Path(os.environ[name]).read_text()
 if os.environ.get("FAIL", "\0") in " ".join([command, *words]):

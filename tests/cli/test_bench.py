@@ -29,11 +29,14 @@ def test_every_part_is_measured_and_written_to_json(tmp_path):
 
 @pytest.mark.renders
 def test_the_simulator_is_timed_with_cameras_and_runs_whole_episodes():
-    step, episodes = benchmark.measure_simulation(QUICK, processes=1)
+    step, *episodes = benchmark.measure_simulation(QUICK, processes=2)
     assert step.name == "control step, 3 cameras 40x30"
     assert step.value > 0
-    assert episodes.unit == "episodes/min"
-    assert episodes.value > 0
+    assert [item.name.split(":")[0] for item in episodes] == ["expert", "zero"]
+    assert "200 steps" in episodes[1].name
+    for item in episodes:
+        assert item.unit == "episodes/min"
+        assert item.ratio == pytest.approx(item.value / item.reference)
 
 
 def test_workloads_take_turns_after_one_warm_up_each():

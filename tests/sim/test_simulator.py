@@ -4,7 +4,6 @@ import pytest
 from ugr_lightning.contract import CAMERAS
 from ugr_lightning.errors import ConfigError, NumericsError, SimulationError
 from ugr_lightning.sim.simulator import Simulator
-from ugr_lightning.sim.tasks import task_names
 
 HOME = np.array([0, -0.96, 1.16, 0, -0.3, 0, 1] * 2, np.float32)
 
@@ -141,24 +140,6 @@ def test_impossible_sizes_and_speeds_are_refused():
         Simulator("click_alarmclock", image_size=(0, 10))
     with pytest.raises(ConfigError, match="speed"):
         Simulator("click_alarmclock", speed=0.0)
-
-
-def test_every_task_makes_a_gymnasium_environment():
-    import gymnasium
-
-    from ugr_lightning.sim.environments import ENVIRONMENTS
-
-    assert len(ENVIRONMENTS) == len(task_names())
-    environment = gymnasium.make("UGR-ClickAlarmclock-v1", obs_mode="rgb", image_size=(30, 40))
-    observation, _ = environment.reset(seed=0)
-    assert set(observation["sensor_data"]) == set(CAMERAS)
-    assert observation["agent"]["qpos"].shape == (1, 14)
-    assert environment.action_space.shape == (14,)
-    _, _, terminated, truncated, info = environment.step(HOME)
-    assert not bool(terminated)
-    assert not bool(truncated)
-    assert not bool(info["success"])
-    environment.close()
 
 
 def test_steps_that_nobody_looks_at_change_no_later_picture(click):

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import torch
@@ -175,11 +175,11 @@ def measure_data(size: Size) -> Iterator[Measurement]:
 
 
 def measure_simulation(size: Size, processes: int) -> Iterator[Measurement]:
-    """A control step with its three pictures, and the episodes of the expert per minute.
+    """A control step with its three pictures, and episodes per minute: of the expert, and of holding still.
 
     Args:
         size: what to simulate.
-        processes: simulators that run episodes side by side.
+        processes: simulators that run episodes side by side; compared with one, in turns.
 
     Raises:
         RenderError: SAPIEN cannot render here.
@@ -194,17 +194,11 @@ def measure_simulation(size: Size, processes: int) -> Iterator[Measurement]:
     try:
         start_all(workers)
         yield _control_step(workers[0], image_size, size)
-        start = time.perf_counter()
-        for index, worker in enumerate(workers):
-            worker.send("episodes", size.episodes, index * size.episodes)
-        steps = sum(worker.receive(EPISODE_TIMEOUT_S) for worker in workers)
-        minutes = (time.perf_counter() - start) / 60
+        yield _episode_rate(workers, "expert", image_size, size)
+        yield _episode_rate(workers, "zero", image_size, size)
     finally:
         for worker in workers:
             worker.kill()
-    count = processes * size.episodes
-    name = f"expert episodes of {steps / count:.0f} steps, {_dimensions(image_size)}, {processes} processes"
-    yield Measurement(name, count / minutes, "episodes/min")
 
 
 class Stopwatch:
@@ -216,7 +210,6 @@ class Stopwatch:
 
     def __init__(self, image_size: tuple[int, int]) -> None:
         self._simulator = open_simulator(None, TASK, image_size=image_size)
-        self._simulator.reset(0)  # the first picture compiles shaders
 
     def control_step(self, steps: int, rounds: int) -> Pace:
         """How long a control step takes: median over the rounds of the mean over the steps."""
@@ -225,13 +218,14 @@ class Stopwatch:
         pace = take_turns(hold, rounds)["hold"]
         return Pace(pace.seconds / steps, pace.cpu_seconds / steps)
 
-    def episodes(self, count: int, first_seed: int) -> int:
-        """Run episodes of the expert; returns the control steps they took."""
+    def episodes(self, policy: Literal["expert", "zero"], count: int, first_seed: int) -> int:
+        """Run episodes, each step with its pictures; returns the control steps they took."""
         steps = 0
         for seed in range(first_seed, first_seed + count):
-            self._simulator.reset(seed)
-            for planned in self._simulator.expert():
-                self._simulator.step(planned.action)
+            home = self._simulator.reset(seed).commanded
+            held = (home for _ in range(self._simulator.horizon))
+            for action in held if policy == "zero" else (planned.action for planned in self._simulator.expert()):
+                self._simulator.step(action)
                 steps += 1
         return steps
 
@@ -302,6 +296,29 @@ def _control_step(worker: Worker, image_size: tuple[int, int], size: Size) -> Me
     aim = "at most 12 ms" if image_size == (120, 160) else ""
     name = f"control step, 3 cameras {_dimensions(image_size)}"
     return Measurement(name, 1e3 * pace.seconds, "ms", 1e3 * pace.cpu_seconds, aim=aim)
+
+
+def _episode_rate(
+    workers: list[Worker], policy: Literal["expert", "zero"], image_size: tuple[int, int], size: Size
+) -> Measurement:
+    """Episodes per minute of all processes, against those of the first alone."""
+    steps: list[int] = []
+
+    def play(crew: list[Worker]) -> None:
+        for index, worker in enumerate(crew):
+            worker.send("episodes", policy, size.episodes, index * size.episodes)
+        steps[:] = [worker.receive(EPISODE_TIMEOUT_S) for worker in crew]
+
+    crews = {"one": workers[:1]} | ({"all": workers} if len(workers) > 1 else {})
+    paces = take_turns({name: partial(play, crew) for name, crew in crews.items()}, -(-size.rounds // 3))
+    length = sum(steps) / (len(steps) * size.episodes)
+    rates = {name: 60 * len(crew) * size.episodes / paces[name].seconds for name, crew in crews.items()}
+    count = "1 process" if len(workers) == 1 else f"{len(workers)} processes"
+    name = f"{policy}: episodes of {length:.0f} steps, {_dimensions(image_size)}, {count}"
+    if len(workers) == 1:
+        return Measurement(name, rates["one"], "episodes/min")
+    aim = "at least 1.8 times one's" if len(workers) == 2 else ""
+    return Measurement(name, rates["all"], "episodes/min", None, rates["one"], rates["all"] / rates["one"], aim)
 
 
 def _slower_is_worse(name: str, paces: dict[str, Pace], aim: str) -> Measurement:

@@ -98,9 +98,9 @@ def _verify(tasks: Sequence[str], settings: Sequence[str], episodes: int, worker
 
     differing = 0
     for name in tasks:
-        checks = [partial(verify_determinism, setting=each, episodes=episodes) for each in settings]
-        for check in (*checks, verify_evaluation_seeds):
-            found = check(name, workers=workers)
+        checks = [partial(verify_determinism, name, setting=each, episodes=episodes) for each in settings]
+        for check in [*checks, partial(verify_evaluation_seeds, name)]:
+            found = check(workers=workers)
             print(found, flush=True)
             differing += len(found.differing)
     return 2 if differing else 0

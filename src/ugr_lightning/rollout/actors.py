@@ -216,7 +216,7 @@ class PolicyActor(Actor):
         """Chunks (B, K, A) and s_k (B, K) for what some slots see, in their order."""
         assert self._images is not None
         if self._sizes is None:
-            self._sizes = self._exact_sizes(min(ROWS, len(self._state)))
+            self._sizes = self._exact_sizes()
         chunks, log_variance = [], []
         for first in range(0, len(slots), ROWS):
             asking = slots[first : first + ROWS]
@@ -228,17 +228,17 @@ class PolicyActor(Actor):
                 log_variance.append(answer[1][: len(asking)])
         return np.concatenate(chunks), np.concatenate(log_variance) if log_variance else None
 
-    def _exact_sizes(self, most: int) -> list[int]:
-        """Numbers of rows up to `most` at which noise is answered as among `ROWS` rows, bit for bit; and `ROWS`."""
+    def _exact_sizes(self) -> list[int]:
+        """Numbers of rows at which noise is answered as among `ROWS` rows, bit for bit; and `ROWS`."""
         assert self._images is not None
         noise = torch.Generator().manual_seed(0)
         images = torch.randint(256, (ROWS, *self._images.shape[1:]), generator=noise, dtype=torch.uint8)
         state = self._state[:1] + 0.1 * torch.randn(ROWS, *self._state.shape[1:], generator=noise)  # (ROWS, T, S)
         whole = self._predict(images, state)
         sizes = []
-        for size in range(1, min(most, ROWS - 1) + 1):
+        for size in range(1, ROWS):
             part = self._predict(images[:size], state[:size])
-            if all(a is None or np.array_equal(a[:size], b) for a, b in zip(whole, part, strict=True)):
+            if all(a is None or b is None or np.array_equal(a[:size], b) for a, b in zip(whole, part, strict=True)):
                 sizes.append(size)
         return [*sizes, ROWS]
 

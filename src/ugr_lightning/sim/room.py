@@ -34,6 +34,11 @@ def furnish(scene: ManiSkillScene, look: Surroundings) -> None:
         _place(scene, item, f"{CLUTTER_NAME}_{number}")
 
 
+def is_furniture(name: str) -> bool:
+    """Whether an actor of a scene belongs to the room and not to the task."""
+    return name in ("table", "room") or name.startswith(CLUTTER_NAME)
+
+
 def illuminate(scene: ManiSkillScene, look: Surroundings) -> None:
     """Add an episode's lights; only where there is a renderer."""
     scene.set_ambient_light(list(look.ambient))

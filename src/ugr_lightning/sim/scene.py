@@ -4,6 +4,7 @@ from abc import abstractmethod
 from collections.abc import Iterator
 from typing import Any, ClassVar, NamedTuple
 
+import gymnasium
 import numpy as np
 import sapien
 import torch
@@ -12,11 +13,12 @@ from mani_skill.sensors.camera import CameraConfig
 from mani_skill.utils.structs.types import SceneConfig, SimConfig
 
 from ugr_lightning.contract import CAMERAS
+from ugr_lightning.errors import ConfigError
 from ugr_lightning.sim.expert import Arms, ExpertStep
 from ugr_lightning.sim.kinematics import SIDES, Array
 from ugr_lightning.sim.objects import pose_of
 from ugr_lightning.sim.robot import ACTION_HIGH, ACTION_LOW, HOME_ACTION, UID
-from ugr_lightning.sim.room import furnish, illuminate
+from ugr_lightning.sim.room import furnish, illuminate, is_furniture
 from ugr_lightning.sim.settings import Point, Surroundings, check_setting, surroundings_of
 from ugr_lightning.sim.shaders import camera_shader
 
@@ -58,7 +60,7 @@ class TwoArmEnv(BaseEnv):
         image_size: (H, W) of the three cameras.
 
     Raises:
-        ConfigError: unknown setting.
+        ConfigError: unknown setting, another robot, several environments in one, or GPU simulation.
     """
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = [UID]
@@ -67,18 +69,24 @@ class TwoArmEnv(BaseEnv):
     version: ClassVar[int]  # raise it when the task changes, and recompute its evaluation seeds
 
     def __init__(
-        self, *args: Any, setting: str = "demo_clean", image_size: tuple[int, int] = (120, 160), **kwargs: Any
+        self,
+        num_envs: int = 1,
+        *,
+        setting: str = "demo_clean",
+        image_size: tuple[int, int] = (120, 160),
+        robot_uids: str = UID,
+        sim_backend: str = "physx_cpu",
+        render_backend: str = "cpu",
+        **kwargs: Any,
     ) -> None:
         check_setting(setting)
+        _check_simulation(num_envs, sim_backend, robot_uids)
         self.setting, self.image_size = setting, image_size
         self.surroundings: Surroundings = surroundings_of(setting, 0)  # of the running episode
         self.command: np.ndarray = HOME_ACTION.copy()  # (14,)
         self.succeeded = False
         self._touches: list[Touch] | None = None
-        kwargs.setdefault("robot_uids", UID)
-        kwargs.setdefault("sim_backend", "physx_cpu")
-        kwargs.setdefault("render_backend", "cpu")
-        super().__init__(*args, **kwargs)
+        super().__init__(1, robot_uids=UID, sim_backend="physx_cpu", render_backend=render_backend, **kwargs)
 
     # ------------------------------------------------------------------------------------------ what a task fills in
 
@@ -148,6 +156,8 @@ class TwoArmEnv(BaseEnv):
 
     def reset(self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None) -> Any:
         """Build a new episode; see `BaseEnv.reset`."""
+        if seed is not None:  # for users of `np_random`; the scene's random numbers are those of the seed alone
+            gymnasium.Env.reset(self, seed=int(np.ravel(seed)[0]))
         return super().reset(seed=seed, options={**(options or {}), "reconfigure": True})
 
     def _load_agent(self, options: dict[str, Any]) -> None:
@@ -185,8 +195,32 @@ class TwoArmEnv(BaseEnv):
         """Whether the task's condition has been met at some control step of the episode."""
         return {"success": torch.tensor([self.succeeded])}
 
-    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, Any]:
-        return {}
+    def compute_sparse_reward(self, obs: Any, action: Any, info: dict[str, Any]) -> torch.Tensor:
+        """1 from the step on in which the task's condition is met, 0 before; (1,) float32."""
+        return info["success"].float()
+
+    def get_info(self) -> dict[str, Any]:
+        """Steps so far and success, not to be changed by later steps."""
+        return {**super().get_info(), "elapsed_steps": self.elapsed_steps.clone()}
+
+    def get_sensor_params(self) -> dict[str, dict[str, torch.Tensor]]:
+        """Parameters of each camera, of this moment."""
+        return {
+            name: {key: value.clone() for key, value in params.items()}
+            for name, params in super().get_sensor_params().items()
+        }
+
+    def _get_obs_extra(self, info: dict[str, Any]) -> dict[str, torch.Tensor]:
+        """Poses of the tools and, in observations of the state, what is known of the props; each (1, n)."""
+        known = {f"{side}_tcp_pose": self.agent.robot.links_map[f"{side}_tcp"].pose.raw_pose for side in SIDES}
+        if "state" in self.obs_mode:
+            for name, actor in sorted(self.scene.actors.items()):
+                if not is_furniture(name):
+                    known[f"{name}_pose"] = actor.pose.raw_pose
+            for name, articulation in sorted(self.scene.articulations.items()):
+                if articulation is not self.agent.robot:
+                    known[f"{name}_pose"], known[f"{name}_qpos"] = articulation.pose.raw_pose, articulation.get_qpos()
+        return known
 
     def _find_touches(self) -> Iterator[Touch]:
         fingers, robot = {}, set()
@@ -201,6 +235,20 @@ class TwoArmEnv(BaseEnv):
                 if points and finger in fingers and other not in robot:
                     name = contact.bodies[body].entity.name.removeprefix("scene-0_")
                     yield Touch(fingers[finger], name, np.asarray(points, np.float64))
+
+
+def _check_simulation(num_envs: int, sim_backend: str, robot_uids: str) -> None:
+    """Refuse what the scenes are not made for.
+
+    A task reads the contacts of its one scene from the processor's memory, and every reset builds that scene anew: in
+    PhysX's GPU simulation neither is possible, because all environments share one scene.
+    """
+    if robot_uids != UID:
+        raise ConfigError("robot_uids", UID, robot_uids, "Leave it out: the tasks are laid out for this robot.")
+    if num_envs != 1 or sim_backend not in ("physx_cpu", "cpu", "auto"):
+        got = f"num_envs={num_envs}, sim_backend={sim_backend!r}"
+        fix = "GPU simulation is not supported; for several environments use `gymnasium.vector.AsyncVectorEnv`."
+        raise ConfigError("environment", "one environment per process, on physx_cpu", got, fix)
 
 
 def side_of(x: float) -> str:
