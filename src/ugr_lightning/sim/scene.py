@@ -65,6 +65,7 @@ class TwoArmEnv(BaseEnv):
 
     SUPPORTED_ROBOTS: ClassVar[list[str]] = [UID]
     SUPPORTED_REWARD_MODES = ("sparse", "none")
+    metadata: ClassVar[dict[str, Any]] = {**BaseEnv.metadata, "render_fps": CONTROL_HZ}
     horizon: ClassVar[int]  # control steps
     version: ClassVar[int]  # raise it when the task changes, and recompute its evaluation seeds
 
