@@ -20,7 +20,12 @@ def episode_path(folder: Path, index: int) -> Path:
 
 
 def find_episodes(folder: Path) -> dict[int, Path]:
-    """The episodes present, by index, in order.
+    """The episodes present, by index, in order; see `numbered_files`."""
+    return numbered_files(Path(folder) / "data")
+
+
+def numbered_files(folder: Path) -> dict[int, Path]:
+    """The episode files of a folder, by index, in order.
 
     Names `episode7`, `episode_7` and `episode_0000007` are understood; unfinished files (`.partial`) are not episodes.
 
@@ -28,7 +33,7 @@ def find_episodes(folder: Path) -> dict[int, Path]:
         DataError: two files claim the same index.
     """
     found: dict[int, Path] = {}
-    for path in sorted((Path(folder) / "data").glob("episode*.hdf5")):
+    for path in sorted(Path(folder).glob("episode*.hdf5")):
         match = EPISODE_NAME.fullmatch(path.name)
         if match is None:
             continue

@@ -10,6 +10,7 @@ import numpy as np
 from ugr_lightning.errors import DataError
 
 MAX_FRAMES = 100_000  # over an hour at 25 Hz; anything longer is not one demonstration
+MAX_COLUMNS = 256  # joints of one robot, generously
 MAX_ROW_BYTES = 2**25  # one frame of one camera, or one chunk that must be unpacked to read it
 FIX = "Record the episode again with `ugr collect`, or remove the file."
 
@@ -80,17 +81,20 @@ def read_array(file: h5py.File, key: str, shape: Sequence[int | None], kind: str
     Args:
         file: open file.
         key: path of the dataset.
-        shape: expected shape; None stands for any length up to `MAX_FRAMES`.
+        shape: expected shape; None stands for any length up to `MAX_FRAMES`, or up to `MAX_COLUMNS` after the first.
         kind: numpy kind letter, `f` float (returned as finite float32) or `b` bool.
 
     Raises:
         DataError: another shape or type, or NaN or infinity in it.
     """
     found, where = find_dataset(file, key), f"{file.filename}:{key}"
-    wanted = "(" + ", ".join("T" if size is None else str(size) for size in shape) + ")"
+    letters = ["T" if axis == 0 else "D" for axis in range(len(shape))]
+    wanted = [letter if size is None else str(size) for letter, size in zip(letters, shape, strict=True)]
     fits = found.shape is not None and len(found.shape) == len(shape)
     if not fits or any(size is not None and size != have for size, have in zip(shape, found.shape, strict=True)):
-        raise DataError(where, f"shape {wanted}", f"{found.shape}", FIX)
+        raise DataError(where, f"shape ({', '.join(wanted)})", f"{found.shape}", FIX)
+    if any(have > MAX_COLUMNS for size, have in zip(shape[1:], found.shape[1:], strict=True) if size is None):
+        raise DataError(where, f"at most {MAX_COLUMNS} columns", f"{found.shape}", FIX)
     if any(have > MAX_FRAMES for have in found.shape):
         raise DataError(where, f"at most {MAX_FRAMES} frames", f"{found.shape}", FIX)
     if found.dtype.kind != kind:
@@ -103,6 +107,18 @@ def read_array(file: h5py.File, key: str, shape: Sequence[int | None], kind: str
         first = np.argwhere(~np.isfinite(values))[0].tolist()
         raise DataError(where, "finite numbers", f"{values[tuple(first)]} at {first}", FIX)
     return values
+
+
+def list_keys(file: h5py.File, key: str) -> tuple[str, ...]:
+    """The names in a group, reached over hard links only; none where there is no such group."""
+    node: object = file
+    for part in key.split("/"):
+        if not isinstance(node, h5py.Group) or not node.id.links.exists(part.encode()):
+            return ()
+        if node.id.links.get_info(part.encode()).type != h5py.h5l.TYPE_HARD:
+            return ()
+        node = node[part]
+    return tuple(map(str, node)) if isinstance(node, h5py.Group) else ()
 
 
 def read_strings(file: h5py.File, key: str, length: int) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ RoboTwin's own tools do not look at it; files of RoboTwin do not have it.
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -14,22 +15,26 @@ import h5py
 import numpy as np
 
 from ugr_lightning.contract import ACTION_DIM, CAMERAS, STATE_DIM
-from ugr_lightning.data.episode import Episode, JpegFrames
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.episode import Episode
+from ugr_lightning.data.folder import publish, read_seeds
+from ugr_lightning.data.formats import Contents, EpisodeLocation, NumberedFiles
+from ugr_lightning.data.frames import JpegFrames, check_jpegs
 from ugr_lightning.data.hdf5 import (
     FIX,
     find_dataset,
     has_key,
+    list_keys,
     open_hdf5,
     read_array,
     read_attribute,
     read_strings,
 )
 from ugr_lightning.data.jpeg import encode_frame, jpeg_size
-from ugr_lightning.errors import ConfigError, DataError
+from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout, policy_cameras
+from ugr_lightning.errors import DataError
 
 FORMAT_VERSION = 1
-MAX_PIXELS = 4096
+VECTOR = "joint_action/vector"
 DISK_CAMERAS = {"cam_high": "head_camera", "cam_right_wrist": "right_camera", "cam_left_wrist": "left_camera"}
 CAMERA_PARAMETERS = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
 
@@ -194,13 +199,16 @@ def _camera_arrays(
     return arrays
 
 
-def read_episode(path: Path, cameras: Sequence[str] = CAMERAS, *, seed: int | None = None) -> Episode:
+def read_episode(
+    path: Path, cameras: Sequence[str] = CAMERAS, *, seed: int | None = None, layout: Layout = DEFAULT_LAYOUT
+) -> Episode:
     """Check one episode file completely and return it with its frames still on disk.
 
     Args:
         path: a RoboTwin 2.0 raw file, ours or RoboTwin's own.
-        cameras: names of `contract.CAMERAS`, in the order wanted.
+        cameras: names of `contract.CAMERAS`, or of further cameras of the file, in the order wanted.
         seed: simulator seed known from `seed.txt`, used where the file does not say.
+        layout: which cameras and joints of the file those are.
 
     Returns:
         T = frames - 1 steps: state[t] = vector[t], action[t] = `ugr/expert_action[t]` or, without it, vector[t + 1].
@@ -212,35 +220,70 @@ def read_episode(path: Path, cameras: Sequence[str] = CAMERAS, *, seed: int | No
     Source: FACTS 1.1, 1.4; headline 6.
     """
     path = Path(path)
-    unknown = [camera for camera in cameras if camera not in DISK_CAMERAS]
-    if unknown or not cameras:
-        known = ", ".join(DISK_CAMERAS)
-        raise ConfigError("data.cameras", f"names among {known}", ", ".join(unknown) or "none", "Correct the name.")
     with open_hdf5(path) as file:
-        vector = read_array(file, "joint_action/vector", (None, STATE_DIM))
+        views = layout.find_cameras(cameras, list_keys(file, "observation"), DISK_CAMERAS, path)
+        vector = read_array(file, VECTOR, (None, layout.width("state")))
         frames = len(vector)
         if frames < 2:
-            raise DataError(f"{path}:joint_action/vector", "at least 2 frames", frames, FIX)
-        state, action, measured = vector[:-1], vector[1:], None
+            raise DataError(f"{path}:{VECTOR}", "at least 2 frames", frames, FIX)
+        names, where = _columns(file, vector.shape[1]), f"{path}:{VECTOR}"
+        state, action, measured = layout.take(vector[:-1], "state", names, where), vector[1:], None
         if has_key(file, "ugr/expert_action"):
-            action = read_array(file, "ugr/expert_action", (frames - 1, ACTION_DIM))
+            action = read_array(file, "ugr/expert_action", (frames - 1, vector.shape[1]))
         if has_key(file, "ugr/measured"):
-            measured = read_array(file, "ugr/measured", (frames, STATE_DIM))[:-1]
-        keys = tuple(f"observation/{DISK_CAMERAS[camera]}/rgb" for camera in cameras)
-        sizes = [_check_jpegs(file, key, frames) for key in keys]
+            joints = read_array(file, "ugr/measured", (frames, vector.shape[1]))[:-1]
+            measured = layout.take(joints, "state", names, where)
+        keys = tuple(f"observation/{view}/rgb" for view in views)
+        sizes = [check_jpegs(file, key, frames) for key in keys]
         if len(set(sizes)) > 1:
             raise DataError(f"{path}:observation", "cameras of one size", sizes, "Choose cameras of one size.")
         extras = _read_extras(file, frames)
     return Episode(
         path=path,
         cameras=tuple(cameras),
-        state=np.ascontiguousarray(state),
-        action=np.ascontiguousarray(action),
+        state=state,
+        action=layout.take(action, "action", names, where),
         frames=JpegFrames(path, keys, sizes[0]),
         measured=measured,
         seed=extras.pop("seed", seed),
         extras=extras,
     )
+
+
+def _columns(file: h5py.File, width: int) -> tuple[str, ...]:
+    """Names of the columns of `joint_action/vector`: left arm, left gripper, right arm, right gripper."""
+    names: list[str] = []
+    for side in ("left", "right"):
+        arm = f"joint_action/{side}_arm"
+        joints = find_dataset(file, arm).shape[-1] if has_key(file, arm) else 0
+        names += [f"{side}_joint_{joint}" for joint in range(1, joints + 1)] + [f"{side}_gripper"]
+    return tuple(names) if len(names) == width else tuple(map(str, range(width)))
+
+
+class RoboTwin(NumberedFiles):
+    """RoboTwin 2.0's raw demonstrations, and ours."""
+
+    name = "robotwin"
+    marks = "`joint_action/vector`, `observation`"
+
+    def matches(self, file: h5py.File) -> bool:
+        """Whether it has the group that no other format has."""
+        return has_key(file, "joint_action")
+
+    def find(self, folder: Path) -> dict[int, EpisodeLocation]:
+        """The episodes with the seeds of `seed.txt`, by index."""
+        seeds = dict(enumerate(read_seeds(folder)))
+        return {i: replace(location, seed=seeds.get(i)) for i, location in super().find(folder).items()}
+
+    def peek(self, location: EpisodeLocation) -> Contents:
+        """The cameras, head and wrists by our names, and the joints as left_joint_1 .. right_gripper."""
+        with open_hdf5(location.path) as file:
+            names = _columns(file, read_array(file, VECTOR, (None, None)).shape[1])
+            return Contents(policy_cameras(list_keys(file, "observation"), DISK_CAMERAS), names, names)
+
+    def read(self, location: EpisodeLocation, cameras: Sequence[str], layout: Layout = DEFAULT_LAYOUT) -> Episode:
+        """See `read_episode`."""
+        return read_episode(location.path, cameras, seed=location.seed, layout=layout)
 
 
 class Executed(NamedTuple):
@@ -271,36 +314,16 @@ def read_executed(path: Path) -> Executed:
     """
     path = Path(path)
     with open_hdf5(path) as file:
-        vector = read_array(file, "joint_action/vector", (None, STATE_DIM))
+        vector = read_array(file, VECTOR, (None, None))
         about = _read_extras(file, len(vector))
         missing = [name for name in ("task", "setting", "seed") if name not in about]
         if missing or not has_key(file, "ugr/measured"):
             got = f"no {', '.join(missing) or 'measured joints'}"
             fix = "Only recordings of `ugr collect` can be replayed."
             raise DataError(path, "a recording that names its task, setting and seed", got, fix)
-        measured = read_array(file, "ugr/measured", (len(vector), STATE_DIM))
+        measured = read_array(file, "ugr/measured", vector.shape)
     version_of_task = about.get("task_version")
     return Executed(path, about["task"], about["setting"], about["seed"], version_of_task, vector[1:], measured)
-
-
-def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
-    """Check every frame of a camera by its header and end marker; return their common (height, width)."""
-    found, where = find_dataset(file, key), f"{file.filename}:{key}"
-    if found.shape != (frames,):
-        raise DataError(where, f"shape ({frames},) as joint_action/vector has", found.shape, FIX)
-    if found.dtype.kind != "S":
-        raise DataError(where, "JPEG bytes (dtype S)", found.dtype, FIX)
-    sizes: list[tuple[int, int]] = []
-    for step in range(frames):  # one row at a time: what a file declares in total is never allocated
-        try:
-            sizes.append(jpeg_size(bytes(found[step])))
-        except ValueError as error:
-            raise DataError(f"{where}[{step}]", "a JPEG", str(error), FIX) from error
-        if sizes[step] != sizes[0]:
-            raise DataError(f"{where}[{step}]", f"a picture of {sizes[0]}", sizes[step], FIX)
-    if max(sizes[0]) > MAX_PIXELS:
-        raise DataError(where, f"pictures of at most {MAX_PIXELS} pixels a side", sizes[0], FIX)
-    return sizes[0]
 
 
 def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
