@@ -25,7 +25,7 @@ ROOMS = {
     "rollout": GROUND | {"data", "models", "sim"},
     "training": GROUND | {"data", "models", "sim", "rollout"},
     "analysis": GROUND | {"data", "models", "sim", "rollout"},
-    "bridges": GROUND | {"data", "models", "sim", "rollout"},
+    "bridges": GROUND | {"data", "models", "sim", "rollout", "training"},
     "cli": GROUND | {"data", "models", "sim", "rollout", "training", "analysis", "bridges"},
 }
 SIMULATORS = {"sapien", "mani_skill", "gymnasium"}

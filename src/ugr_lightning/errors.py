@@ -41,3 +41,7 @@ class RenderError(SimulationError):
 
 class NumericsError(UGRError):
     """A NaN or infinity in a loss, an observation or an action."""
+
+
+class ProtocolError(UGRError):
+    """An observation or a message of another program that does not keep to the agreed form."""
