@@ -86,16 +86,19 @@ def read_resized(episode: Episode, step: int, out: np.ndarray) -> None:
         row[:] = np.asarray(Image.fromarray(picture).resize(out.shape[2:0:-1], Image.Resampling.BOX))
 
 
-def open_frames(episodes: Sequence[Episode], cache: Cache, image_size: tuple[int, int] | None = None) -> FrameStore:
+def open_frames(
+    episodes: Sequence[Episode], cache: Cache, image_size: tuple[int, int] | None = None, folder: Path | None = None
+) -> FrameStore:
     """Make the frames of some episodes available.
 
     Args:
         episodes: demonstrations, all with the same cameras and stored size.
         cache: `ram` decodes once per run, `memmap` once for all runs and processes, `none` whenever a frame is used.
         image_size: (height, width) to shrink to; None for the stored size.
+        folder: where a `memmap` goes, into a subfolder `.cache`; None for where our recordings have it.
 
     Raises:
-        DataError: episodes of different sizes, a frame that is no JPEG.
+        DataError: episodes of different sizes, a frame that is no JPEG, a folder that cannot be written to.
         ConfigError: a size larger than the stored one, or more frames than memory or disk can hold.
     """
     sizes = {episode.image_size for episode in episodes}
@@ -114,21 +117,26 @@ def open_frames(episodes: Sequence[Episode], cache: Cache, image_size: tuple[int
         _decode_all(episodes, array)
         return ArrayStore(array)
     if cache == "memmap":
-        return _open_memmap(episodes, shape)
+        home = folder or episodes[0].path.parent.parent
+        return _open_memmap(episodes, shape, (home if home.is_dir() else home.parent) / ".cache")
     raise ConfigError("data.cache", "`ram`, `memmap` or `none`", cache, "Correct the name.")
 
 
-def _open_memmap(episodes: Sequence[Episode], shape: tuple[int, ...]) -> FrameStore:
+def _open_memmap(episodes: Sequence[Episode], shape: tuple[int, ...], folder: Path) -> FrameStore:
     """Map the decoded frames beside the episodes; decode them first when missing or made from other files."""
-    folder = episodes[0].path.parent.parent / ".cache"
-    what = [[str(episode.path.name) for episode in episodes], list(episodes[0].cameras), list(shape)]
-    files = [episode.path.stat() for episode in episodes]
+    names = [[episode.path.name, episode.name, list(episode.frames.keys)] for episode in episodes]
+    what = [names, list(episodes[0].cameras), list(shape)]
+    files = [path.stat() for episode in episodes for path in episode.frames.files]
     sources = [[file.st_size, file.st_mtime_ns] for file in files]
     path = folder / f"frames-{_digest(what)}-{_digest(sources)}.npy"
     if not path.is_file():
-        for stale in folder.glob(f"frames-{_digest(what)}-*.npy"):
-            stale.unlink()
-        folder.mkdir(exist_ok=True)
+        try:
+            for stale in folder.glob(f"frames-{_digest(what)}-*.npy"):
+                stale.unlink()
+            folder.mkdir(exist_ok=True)
+        except OSError as error:
+            fix = "Use `--data.cache ram`, or `none`."
+            raise DataError(folder, "a folder that decoded frames can be written to", error, fix) from error
         _require_space(shape, shutil.disk_usage(folder).free, "disk", "Free some space, or use `--data.cache none`.")
 
         def write(partial: Path) -> None:

@@ -14,8 +14,8 @@ from ugr_lightning.contract import CAMERAS, CHUNK_LENGTH, Batch, Statistics
 from ugr_lightning.data.cache import Cache, open_frames
 from ugr_lightning.data.chunks import AfterEnd, ChunkDataset, ProprioceptionKind
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import find_episodes, read_seeds
-from ugr_lightning.data.formats.robotwin import read_episode
+from ugr_lightning.data.formats import EpisodeFormat, EpisodeLocation, detect, episode_files, recognise
+from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.data.sampling import BatchSampler, EpochOrder, Sampling
 from ugr_lightning.data.split import Split, split_episodes
 from ugr_lightning.data.statistics import compute_statistics
@@ -41,6 +41,7 @@ class Recording:
     workers: int = 2
 
 
+RECORDED = "robotwin"  # the format that demonstrations are recorded in
 DEFAULT_SAMPLING = Sampling()
 DEFAULT_RECORDING = Recording()
 
@@ -71,6 +72,9 @@ class ChunkDataModule(lightning.LightningDataModule):
         observation_steps: T, observations per sample, the newest and those just before it.
         sampling: how training samples are drawn.
         recording: how missing demonstrations are recorded.
+        folder: demonstrations that are elsewhere, of any format that is recognised, instead of `root`, `task` and
+            `setting`; nothing is recorded there.
+        layout: which cameras and joints of the files the policy sees, where they are not those of our robot.
 
     Source: DESIGN 4 and 5.
     """
@@ -99,6 +103,8 @@ class ChunkDataModule(lightning.LightningDataModule):
         observation_steps: int = 1,
         sampling: Sampling = DEFAULT_SAMPLING,
         recording: Recording = DEFAULT_RECORDING,
+        folder: str | None = None,
+        layout: Layout = DEFAULT_LAYOUT,
     ) -> None:
         super().__init__()
         for name, value, least in (
@@ -112,12 +118,14 @@ class ChunkDataModule(lightning.LightningDataModule):
             if value < least:
                 raise ConfigError(f"data.{name}", f"at least {least}", value, "Correct the number.")
         self.task, self.setting, self.episodes = task, setting, episodes
-        self.folder = Path(root) / task / setting
+        self.elsewhere = folder is not None
+        self.folder = Path(root) / task / setting if folder is None else Path(folder)
         self.cameras, self.image_size, self.cache = tuple(cameras), image_size, cache
         self.chunk_length, self.batch_size, self.val_stride = chunk_length, batch_size, val_stride
         self.num_workers, self.seed, self.split_seed = num_workers, seed, split_seed
         self.state, self.action_offset, self.after_end = state, action_offset, after_end
         self.observation_steps, self.sampling, self.recording = observation_steps, sampling, recording
+        self.layout = layout
         self.demonstrations: list[Episode] = []
 
     def prepare_data(self) -> None:
@@ -126,11 +134,13 @@ class ChunkDataModule(lightning.LightningDataModule):
         Raises:
             DataError: too few demonstrations, and nobody to record them.
         """
-        if len(find_episodes(self.folder)) < self.episodes and self.recorder is not None:
-            self.recorder(self)
+        if self.recorder is not None and not self.elsewhere:
+            form, found = self._find()
+            if len(found) < self.episodes and (form is None or form.name == RECORDED):
+                self.recorder(self)
         self._chosen()
         if self.cache == "memmap":
-            open_frames(self._read(), self.cache, self.image_size)
+            open_frames(self._read(), self.cache, self.image_size, self.folder)
 
     def setup(self, stage: str | None = None) -> None:
         """Check the demonstrations, split them, compute statistics and decode; the second call does nothing."""
@@ -139,22 +149,31 @@ class ChunkDataModule(lightning.LightningDataModule):
         episodes = self._read()
         self.episode_split: Split = split_episodes(len(episodes), self.split_seed)
         self.statistics: Statistics = compute_statistics(episodes, self.episode_split.train, state=self.state)
-        store = open_frames(episodes, self.cache, self.image_size)
+        store = open_frames(episodes, self.cache, self.image_size, self.folder)
         self.image_size = self.image_size or episodes[0].image_size
         conventions = (self.state, self.action_offset, self.after_end, self.observation_steps)
         self.data = ChunkDataset(episodes, store, self.chunk_length, *conventions)
         self.demonstrations = episodes
 
-    def _chosen(self) -> dict[int, Path]:
-        found = find_episodes(self.folder)
-        if len(found) < self.episodes:
+    def _find(self) -> tuple[EpisodeFormat | None, dict[int, EpisodeLocation]]:
+        """The format and the episodes of the folder; no format where nothing was recorded yet."""
+        if not self.elsewhere and not episode_files(self.folder) and not recognise(self.folder):
+            return None, {}
+        form = detect(self.folder)
+        return form, form.find(self.folder)
+
+    def _chosen(self) -> tuple[EpisodeFormat, list[EpisodeLocation]]:
+        form, found = self._find()
+        if form is None or len(found) < self.episodes:
             fix = f"Record them with `ugr collect --task {self.task} --episodes {self.episodes}`."
+            if form is not None and (self.elsewhere or form.name != RECORDED):
+                fix = f"Set `data.episodes` to {len(found)} or less."
             raise DataError(self.folder, f"{self.episodes} demonstrations", len(found), fix)
-        return dict(list(found.items())[: self.episodes])
+        return form, list(found.values())[: self.episodes]
 
     def _read(self) -> list[Episode]:
-        seeds = dict(enumerate(read_seeds(self.folder)))
-        return [read_episode(path, self.cameras, seed=seeds.get(index)) for index, path in self._chosen().items()]
+        form, locations = self._chosen()
+        return [form.read(location, self.cameras, self.layout) for location in locations]
 
     @property
     def split(self) -> dict[str, Any]:

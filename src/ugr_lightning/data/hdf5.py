@@ -133,7 +133,7 @@ def read_strings(file: h5py.File, key: str, length: int) -> tuple[str, ...]:
     return tuple(value.decode(errors="replace") for value in found[()])
 
 
-def read_attribute(file: h5py.File, name: str) -> int | float | str | None:
+def read_attribute(file: h5py.File, name: str) -> bool | int | float | str | None:
     """A single number or string of fixed width at the root of a file; None where there is no such thing.
 
     Strings of variable width are passed over: a damaged one can keep the HDF5 library busy for ever.
@@ -141,7 +141,7 @@ def read_attribute(file: h5py.File, name: str) -> int | float | str | None:
     if name not in file.attrs:
         return None
     attribute = file.attrs.get_id(name)
-    if attribute.shape != () or attribute.dtype.kind not in "iufS":
+    if attribute.shape != () or attribute.dtype.kind not in "biufS":
         return None
     value = file.attrs[name]
     return value.decode(errors="replace") if isinstance(value, bytes) else value.item()

@@ -20,6 +20,7 @@ from ugr_lightning.data.folder import (
     write_scene_info,
     write_seeds,
 )
+from ugr_lightning.data.formats import recognise
 from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.progress import Progress
@@ -243,9 +244,10 @@ def _is_complete(folder: Path, episodes: int, settings: dict[str, Any]) -> bool:
     if set(range(episodes)) <= present:
         return True
     if not path.is_file():
-        if present:
+        foreign = ", ".join(form.name for form in recognise(folder))
+        if present or foreign:
             fix = "Record into another folder, or ask for no more episodes than there are."
-            got = f"{len(present)} episodes from elsewhere (no recording.json)"
+            got = f"{len(present) or foreign} episodes from elsewhere (no recording.json)"
             raise DataError(folder, f"an empty folder or {episodes} episodes", got, fix)
         content = json.dumps({**settings, "package_version": version("ugr-lightning")}, indent=2) + "\n"
         publish_text(path, content)

@@ -2,6 +2,7 @@
 
 import math
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -13,8 +14,8 @@ from torchmetrics import Metric
 from torchmetrics.aggregation import MeanMetric
 from torchmetrics.regression import SpearmanCorrCoef
 
-from ugr_lightning.contract import Batch, Chunk, ChunkPolicy
-from ugr_lightning.errors import NumericsError
+from ugr_lightning.contract import Batch, Chunk, ChunkPolicy, Statistics
+from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.training.checkpoint import describe
 
 
@@ -53,8 +54,14 @@ class PolicyModule(LightningModule):
         self.last_chunk: Chunk | None = None  # of the validation batch at hand; the figures read it
 
     def setup(self, stage: str) -> None:
-        """Hand the training episodes' statistics to the policy; a checkpoint restored later overwrites them."""
-        statistics = self.trainer.datamodule.statistics  # type: ignore[attr-defined]
+        """Hand the training episodes' statistics to the policy; a checkpoint restored later overwrites them.
+
+        Raises:
+            ConfigError: the policy is made for other joints or cameras than the demonstrations have.
+        """
+        data: Any = self.trainer.datamodule  # type: ignore[attr-defined]
+        statistics = data.statistics
+        check_fit(self.policy, statistics, getattr(data, "cameras", self.policy.cameras))
         self._action_std = statistics.action_std
         if stage == "fit":
             self.policy.set_statistics(statistics)
@@ -172,6 +179,25 @@ class PolicyModule(LightningModule):
             f"The batch and the weights are in {dump}; look at those episodes, or lower the learning rate. "
             "`ugr fit --ckpt_path last` goes on from the last checkpoint.",
         )
+
+
+def check_fit(policy: ChunkPolicy, statistics: Statistics, cameras: Sequence[str]) -> None:
+    """Make sure that a policy sees and commands what the demonstrations hold.
+
+    Args:
+        policy: what is trained.
+        statistics: of the demonstrations; their lengths are S and A.
+        cameras: the demonstrations' cameras, in order.
+
+    Raises:
+        ConfigError: another number of joints, or other cameras; shows both sides.
+    """
+    wanted = (policy.state_dim, policy.action_dim, tuple(policy.cameras))
+    found = (len(statistics.state_mean), len(statistics.action_mean), tuple(cameras))
+    if wanted != found:
+        expected, got = (f"state {s}, action {a}, cameras {', '.join(c)}" for s, a, c in (wanted, found))
+        fix = "Set the policy's `state_dim`, `action_dim` and `cameras`, or choose joints with `data.layout`."
+        raise ConfigError("demonstrations", f"what the policy is made for ({expected})", got, fix)
 
 
 def found_by(refined: Tensor, error: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:

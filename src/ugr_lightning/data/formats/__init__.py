@@ -13,7 +13,7 @@ from typing import ClassVar
 import h5py
 
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import find_episodes, numbered_files
+from ugr_lightning.data.folder import find_episodes, numbered_files, publish
 from ugr_lightning.data.hdf5 import open_hdf5
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import ConfigError, DataError
@@ -140,6 +140,38 @@ class NumberedFiles(EpisodeFormat):
     def find(self, folder: Path) -> dict[int, EpisodeLocation]:
         """The numbered files, by number."""
         return {index: EpisodeLocation(path) for index, path in episode_files(folder).items()}
+
+    def write(
+        self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None
+    ) -> None:
+        """Write one file per episode, see `EpisodeFormat.write`."""
+        others = [one.name for one in recognise(folder) if one.name != self.name]
+        if others:
+            fix = "Choose an empty folder."
+            raise DataError(folder, f"a folder for {self.name}", f"demonstrations of {others[0]}", fix)
+        for index, episode in enumerate(episodes):
+            path = self.episode_file(Path(folder), index)
+            if not path.exists():
+                publish(path, lambda partial, episode=episode: self._write_file(partial, episode))
+                episode.frames.close()
+            done(index)
+
+    def episode_file(self, folder: Path, index: int) -> Path:
+        """Where an episode is written."""
+        return folder / f"episode_{index}.hdf5"
+
+    def fill(self, file: h5py.File, episode: Episode) -> None:
+        """Write one episode into an open, empty file.
+
+        Raises:
+            ConfigError: this format is only read.
+            DataError: an episode that the format cannot hold; says why.
+        """
+        raise ConfigError("--to", "a format that can be written", self.name, "Choose another.")
+
+    def _write_file(self, path: Path, episode: Episode) -> None:
+        with h5py.File(path, "w") as file:
+            self.fill(file, episode)
 
     def _is_one(self, path: Path) -> bool:
         try:

@@ -16,7 +16,7 @@ import numpy as np
 
 from ugr_lightning.contract import ACTION_DIM, CAMERAS, STATE_DIM
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import publish, read_seeds
+from ugr_lightning.data.folder import episode_path, publish, read_seeds
 from ugr_lightning.data.formats import Contents, EpisodeLocation, NumberedFiles
 from ugr_lightning.data.frames import JpegFrames, check_jpegs
 from ugr_lightning.data.hdf5 import (
@@ -143,12 +143,10 @@ def write_episode(
 
 def _write_robot(file: h5py.File, commanded: np.ndarray, endpose: np.ndarray) -> None:
     """`joint_action/*` and `endpose/*`, all float64."""
-    for side, start, pose in (("left", 0, 0), ("right", 7, 1)):
-        file[f"joint_action/{side}_arm"] = commanded[:, start : start + 6]
-        file[f"joint_action/{side}_gripper"] = commanded[:, start + 6]
+    _write_joints(file, commanded)
+    for pose, side in enumerate(("left", "right")):
         file[f"endpose/{side}_endpose"] = endpose[:, pose]
-        file[f"endpose/{side}_gripper"] = commanded[:, start + 6]
-    file["joint_action/vector"] = commanded
+        file[f"endpose/{side}_gripper"] = file[f"joint_action/{side}_gripper"][()]
 
 
 def _checked(path: Path, key: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -284,6 +282,51 @@ class RoboTwin(NumberedFiles):
     def read(self, location: EpisodeLocation, cameras: Sequence[str], layout: Layout = DEFAULT_LAYOUT) -> Episode:
         """See `read_episode`."""
         return read_episode(location.path, cameras, seed=location.seed, layout=layout)
+
+    def episode_file(self, folder: Path, index: int) -> Path:
+        """RoboTwin's own place and spelling."""
+        return episode_path(folder, index)
+
+    def fill(self, file: h5py.File, episode: Episode) -> None:
+        """Write an episode of another format: T steps give T + 1 frames, the last with the pictures of step T - 1.
+
+        The label goes to `ugr/expert_action` where it is not the next state. Poses and cameras' parameters, which
+        other formats do not have, are left out rather than made up. Pictures are compressed, unless they already were.
+        """
+        joints = episode.state.shape[1]
+        if episode.action.shape != episode.state.shape or joints < 4 or joints % 2:
+            got = f"{joints} states, {episode.action.shape[1]} actions"
+            expected = "two arms, each with a gripper, in states and actions alike"
+            raise DataError(episode.path, expected, got, "Convert to `act` instead.")
+        vector = np.concatenate([episode.state, episode.action[-1:]]).astype(np.float64)  # (T + 1, S)
+        for name in _ATTRIBUTES:
+            value = episode.seed if name == "seed" else episode.extras.get(name)
+            if value is not None:
+                file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+        _write_joints(file, vector)
+        if not np.array_equal(vector[1:], episode.action):
+            file["ugr/expert_action"] = episode.action
+        jpegs = [_jpegs(episode, step) for step in range(episode.length)]
+        for view, camera in enumerate(episode.cameras):
+            frames = [step[view] for step in [*jpegs, jpegs[-1]]]
+            file[f"observation/{DISK_CAMERAS.get(camera, camera)}/rgb"] = np.array(frames, dtype=bytes)
+        file["pointcloud"] = np.zeros((len(vector), 0))
+
+
+def _write_joints(file: h5py.File, vector: np.ndarray) -> None:
+    """`joint_action/*`, float64, from (T, S)."""
+    half = vector.shape[1] // 2
+    for side, start in (("left", 0), ("right", half)):
+        file[f"joint_action/{side}_arm"] = vector[:, start : start + half - 1]
+        file[f"joint_action/{side}_gripper"] = vector[:, start + half - 1]
+    file[VECTOR] = vector
+
+
+def _jpegs(episode: Episode, step: int) -> tuple[bytes, ...]:
+    """The pictures of one step as RoboTwin stores them; JPEGs are passed on as they are."""
+    if isinstance(episode.frames, JpegFrames):
+        return episode.frames.encoded(step)
+    return encode_frame(episode.images(step))
 
 
 class Executed(NamedTuple):
