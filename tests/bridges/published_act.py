@@ -10,6 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
+SMALL = {"dim": 32, "heads": 4, "feedforward": 48, "layers": 2, "steps": 6, "state": 5, "action": 4, "latent": 3}
+SMALL["width"] = 4
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
@@ -202,12 +204,19 @@ class LeRobotACT(nn.Module):
         return self.action_head(self.decoder.norm(x).transpose(0, 1))  # the last layer's
 
 
-def shake(module: nn.Module) -> nn.Module:
-    """Make every number matter: biases, embeddings and frozen statistics away from 0 and 1."""
+def small(kind: type[nn.Module], decoder_layers: int) -> nn.Module:
+    """A small network in which every number matters: biases and frozen statistics are away from 0 and 1."""
     torch.manual_seed(0)
+    module = kind(**SMALL, decoder_layers=decoder_layers)
     for name, value in [*module.named_parameters(), *module.named_buffers()]:
         if name.endswith("running_var"):
             value.data.uniform_(0.5, 2.0)
         elif value.dim() == 1:
             value.data.add_(0.3 * torch.randn_like(value))
     return module.eval()
+
+
+def seen() -> tuple[Tensor, Tensor]:
+    """What two cameras see, (B, V, 3, H, W) uint8, and a state (B, S) in robot units; two samples."""
+    draw = torch.Generator().manual_seed(1)
+    return torch.randint(256, (2, 2, 3, 64, 96), dtype=torch.uint8, generator=draw), torch.randn(2, 5, generator=draw)

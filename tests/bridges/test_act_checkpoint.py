@@ -1,6 +1,6 @@
 import pytest
 import torch
-from published_act import OriginalACT
+from published_act import OriginalACT, seen, small
 
 from ugr_lightning.bridges.act_checkpoint import DEAD, ORIGINAL, export_act, import_act
 from ugr_lightning.bridges.act_layout import sizes_of, translate
@@ -10,6 +10,22 @@ from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.act import ACT
 
 TWO = ("top", "wrist")
+
+
+@pytest.fixture
+def original():
+    """Seven decoder layers, of which the first is read."""
+    return small(OriginalACT, decoder_layers=7)
+
+
+@pytest.fixture
+def images():
+    return seen()[0]
+
+
+@pytest.fixture
+def state():
+    return seen()[1]
 
 
 @pytest.fixture
