@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "report": ("ugr_lightning.cli.report:run", "compare policies: intervals, paired tests, what may be concluded"),
     "replay": ("ugr_lightning.cli.replay:run", "execute recorded commands again and confirm the outcome"),
     "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
+    "bridge": ("ugr_lightning.cli.bridge:run", "let RoboTwin or XPolicyLab evaluate a checkpoint"),
     "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }
 

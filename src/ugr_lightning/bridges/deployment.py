@@ -1,0 +1,206 @@
+"""A trained policy that acts in environments of other projects: named pictures and joints in, commands out."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from PIL import Image
+
+from ugr_lightning.contract import CAMERAS, ChunkPolicy
+from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
+from ugr_lightning.models.normalizer import Normalizer
+from ugr_lightning.models.refine.budget import with_refine_ratio
+from ugr_lightning.rollout.actors import PolicyActor
+from ugr_lightning.training.checkpoint import load_policy
+
+WHOLE_CHUNKS = "chunk"
+"""The execution that plays every chunk to its end."""
+
+
+class Seen(NamedTuple):
+    """An observation as a `PolicyActor` reads it.
+
+    Args:
+        images: (3, H, W, 3) uint8 RGB, in the order of `CAMERAS`; (0, H, W, 3) where nobody looks.
+        commanded: (S,) float32, robot units.
+        measured: (S,) float32; the outside says only one of the two.
+    """
+
+    images: np.ndarray
+    commanded: np.ndarray
+    measured: np.ndarray
+
+
+class Deployment:
+    """A checkpoint with its execution, for several environments (slots) that run independently of each other.
+
+    Acts through the same `PolicyActor` as `ugr rollout`, so that the same pictures and joints give the same commands
+    bit for bit, whatever the other slots do.
+
+    Args:
+        checkpoint: file from `ugr fit`.
+        cameras: the policy's name of a camera: the environment's.
+        execution: `aggregate`, `aggregate-variance`, the number of steps executed of each chunk, or `chunk` for all.
+        slots: how many environments at most.
+        image_size: (height, width) that pictures are scaled to; None takes the size of the training.
+        device: where the policy computes; `auto` takes a GPU where there is one.
+        refine_ratio: share of each chunk that is refined, in place of the one in training.
+
+    Raises:
+        CheckpointError: not a usable checkpoint; or one without normalisation statistics or size of the pictures.
+        ConfigError: an execution or a device that does not exist, or a camera without a name in the environment.
+
+    Source: FACTS 6.1 (aggregation), 10.16 (missing statistics), 10.19 (reset and advance once per step).
+    """
+
+    def __init__(
+        self,
+        checkpoint: Path | str,
+        *,
+        cameras: Mapping[str, str],
+        execution: str | int = "aggregate",
+        slots: int = 1,
+        image_size: tuple[int, int] | None = None,
+        device: str = "auto",
+        refine_ratio: float | None = None,
+    ) -> None:
+        policy, self.info = load_policy(checkpoint)
+        require_statistics(policy, checkpoint)
+        self.cameras = _named(policy, cameras)
+        self.image_size = _size(image_size or self.info.data.get("image_size"), checkpoint)
+        self.state_dim, self.action_dim, self.chunk_length = policy.state_dim, policy.action_dim, policy.chunk_length
+        if refine_ratio is not None:
+            policy = with_refine_ratio(policy, refine_ratio)
+        policy = policy.to(_device(device)).for_inference()
+        self._actor = PolicyActor(policy, name=type(policy).__name__)
+        self._actor.begin(slots, policy.chunk_length if execution == WHOLE_CHUNKS else execution)
+        self._begins = set(range(slots))
+
+    def __str__(self) -> str:
+        height, width = self.image_size
+        trained = self.info.data.get("task", "an unknown task")
+        return (
+            f"{self._actor.name} of {self.info.path} (sha256 {self.info.sha256[:12]}), trained on {trained}, "
+            f"execution {self._actor.execution}, pictures {height}x{width}"
+        )
+
+    def begin(self, slot: int) -> None:
+        """An episode begins in a slot: forget its chunks and observations."""
+        self._begins.add(slot)
+
+    def see(self, pictures: Mapping[str, Any], state: Any) -> Seen:
+        """Check an observation and bring it into the policy's form.
+
+        Args:
+            pictures: by the environment's names of the cameras, (H, W, 3) uint8 RGB of any size.
+            state: (S,) joints in robot units.
+
+        Raises:
+            ProtocolError: a camera is missing, or a picture or the joints have another form.
+        """
+        joints = np.asarray(state)
+        if joints.shape != (self.state_dim,) or joints.dtype.kind not in "fiu":
+            got = f"{joints.shape} {joints.dtype}"
+            raise ProtocolError("joints", f"{self.state_dim} numbers", got, "Evaluate on the robot of the training.")
+        if not np.isfinite(joints).all():
+            raise ProtocolError("joints", "finite numbers", "a NaN or an infinity", "Look at the environment.")
+        joints = joints.astype(np.float32)
+        images = np.zeros((len(CAMERAS), *self.image_size, 3), np.uint8)
+        for camera, name in self.cameras.items():
+            if name not in pictures:
+                fix = "Say with `cameras` what the environment calls it."
+                raise ProtocolError(f"camera {camera}", f"a picture `{name}`", sorted(map(str, pictures)), fix)
+            images[CAMERAS.index(camera)] = scaled(pictures[name], self.image_size, name)
+        return Seen(images, joints, joints)
+
+    def act(self, seen: Mapping[int, Seen]) -> dict[int, np.ndarray]:
+        """Commands of some slots until the policy wants to see one of them again; moves each on by as many steps.
+
+        Args:
+            seen: the newest observation of each slot.
+
+        Returns:
+            by slot (n, A) float32, absolute joint targets in robot units; the same n for all.
+
+        Raises:
+            NumericsError: a command is not finite.
+        """
+        for slot in self._begins & set(seen):
+            self._actor.start(slot, 0, seen[slot])
+        self._begins -= set(seen)
+        plans: dict[int, list[np.ndarray]] = {slot: [] for slot in seen}
+        while True:
+            for slot, decision in self._actor.act(seen).items():
+                plans[slot].append(_finite(decision.action, slot))
+            if any(self._actor.looks(slot) for slot in seen):
+                return {slot: np.stack(plan) for slot, plan in plans.items()}  # (n, A)
+            seen = {slot: frame._replace(images=frame.images[:0]) for slot, frame in seen.items()}
+
+
+def require_statistics(policy: ChunkPolicy, checkpoint: Path | str) -> None:
+    """Refuse a policy that would act un-normalised.
+
+    Raises:
+        CheckpointError: its normalisation was never fitted.
+    """
+    if not all(module.fitted for module in policy.modules() if isinstance(module, Normalizer)):
+        fix = "Use a checkpoint that was written after training began; `ugr inspect` shows its statistics."
+        raise CheckpointError(checkpoint, "normalisation statistics", "none", fix)
+
+
+def scaled(picture: Any, size: tuple[int, int], name: str = "picture") -> np.ndarray:
+    """A picture in another size: smaller ones average areas, as training does; larger ones interpolate.
+
+    Args:
+        picture: (H, W, 3) uint8.
+        size: (height, width).
+        name: for the error.
+
+    Raises:
+        ProtocolError: it is no such picture.
+    """
+    array = np.asarray(picture)
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] != 3 or 0 in array.shape:
+        raise ProtocolError(name, "(H, W, 3) uint8 RGB", f"{array.shape} {array.dtype}", "Send the decoded picture.")
+    if array.shape[:2] == tuple(size):
+        return array
+    shrinks = size[0] <= array.shape[0] and size[1] <= array.shape[1]
+    how = Image.Resampling.BOX if shrinks else Image.Resampling.BILINEAR
+    return np.asarray(Image.fromarray(array).resize(size[::-1], how))
+
+
+def _named(policy: ChunkPolicy, cameras: Mapping[str, str]) -> dict[str, str]:
+    missing = sorted(set(policy.cameras) - set(cameras))
+    if missing:
+        fix = "Name them with `cameras`, e.g. {cam_high: head_camera}."
+        raise ConfigError("cameras", f"the environment's names of {', '.join(policy.cameras)}", f"no {missing}", fix)
+    return {camera: cameras[camera] for camera in policy.cameras}
+
+
+def _size(size: Any, checkpoint: Path | str) -> tuple[int, int]:
+    if size is None:
+        fix = "Say with `image_size` how large the pictures of its training were."
+        raise CheckpointError(checkpoint, "the size of the pictures", "none", fix)
+    height, width = size
+    return int(height), int(width)
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        return torch.empty(0, device=name).device
+    except (RuntimeError, AssertionError) as error:
+        fix = "Use `auto`, `cpu` or `cuda:0`."
+        raise ConfigError("device", "a device of this machine", name, fix) from error
+
+
+def _finite(action: np.ndarray | None, slot: int) -> np.ndarray:
+    assert action is not None, "a policy decides for itself"
+    if not np.isfinite(action).all():
+        bad = np.flatnonzero(~np.isfinite(action))[:5].tolist()
+        fix = "Check the checkpoint; the robot has not seen it."
+        raise NumericsError(f"action of environment {slot}", "finite numbers", f"NaN or infinity at {bad}", fix)
+    return action

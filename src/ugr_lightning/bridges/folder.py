@@ -1,0 +1,45 @@
+"""Folders that other projects import: written from the package's templates, and never over somebody else's files."""
+
+import os
+import re
+from collections.abc import Mapping
+from importlib.resources import files
+from pathlib import Path
+
+from ugr_lightning.errors import ConfigError
+
+MARK = "Written by `ugr bridge"
+"""Every file of ours contains it; other files are left alone."""
+
+
+def write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Path]:
+    """Fill in the files of a template.
+
+    Args:
+        template: folder under `templates`; its files are called like the written ones, with `.txt` behind.
+        out: where to; existing files of ours are replaced.
+        values: what takes the place of `@NAME@`.
+
+    Returns:
+        The files written.
+
+    Raises:
+        ConfigError: one of the files exists and is not ours, or the folder cannot be written.
+    """
+    contents: dict[Path, str] = {}
+    for source in sorted(files("ugr_lightning.bridges").joinpath("templates", template).iterdir(), key=str):
+        body = source.read_text(encoding="utf-8")
+        contents[out / source.name.removesuffix(".txt")] = re.sub("@([A-Z_]+)@", lambda found: values[found[1]], body)
+    for path in contents:
+        if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
+            raise ConfigError(path, "a file that `ugr bridge` wrote", "another one", "Choose another folder.")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for path, content in contents.items():
+            aside = path.with_name(path.name + ".partial")
+            aside.write_text(content, encoding="utf-8")
+            aside.chmod(0o755 if path.suffix == ".sh" else 0o644)
+            os.replace(aside, path)
+    except OSError as error:
+        raise ConfigError(out, "a folder that can be written", error, "Choose another folder.") from error
+    return list(contents)

@@ -1,0 +1,99 @@
+"""Values of other projects' configs, whose command lines leave strings where numbers and switches are meant."""
+
+import ast
+from collections.abc import Mapping
+from typing import Any
+
+from ugr_lightning.bridges.deployment import WHOLE_CHUNKS
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.rollout.aggregation import AGGREGATE, AGGREGATE_VARIANCE
+
+SWITCHES = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
+NOTHING = ("", "none", "null", "~")
+
+
+def switch(config: Mapping[str, Any], key: str) -> bool | None:
+    """A switch; None where it is not set.
+
+    Raises:
+        ConfigError: neither yes nor no.
+
+    Source: FACTS 6.2: `--key false` arrives as the string "false", which Python takes for true.
+    """
+    value = _value(config, key)
+    if value is None or isinstance(value, bool):
+        return value
+    if str(value).strip().lower() in SWITCHES:
+        return SWITCHES[str(value).strip().lower()]
+    raise ConfigError(key, "true or false", repr(value), "Correct the value.")
+
+
+def text(config: Mapping[str, Any], key: str, default: str | None = None) -> str:
+    """A text.
+
+    Raises:
+        ConfigError: it is not set and has no default.
+    """
+    value = _value(config, key)
+    if value is None and default is None:
+        raise ConfigError(key, "a text", "nothing", f"Set `{key}` in the policy's yml.")
+    return str(default if value is None else value)
+
+
+def number(config: Mapping[str, Any], key: str) -> float | None:
+    """A number; None where it is not set.
+
+    Raises:
+        ConfigError: something else.
+    """
+    value = _value(config, key)
+    try:
+        if isinstance(value, bool):
+            raise ValueError(value)
+        return None if value is None else float(value)
+    except (TypeError, ValueError) as error:
+        raise ConfigError(key, "a number", repr(value), "Correct the value.") from error
+
+
+def shape(config: Mapping[str, Any], key: str) -> tuple[int, int] | None:
+    """Height and width; None where they are not set.
+
+    Raises:
+        ConfigError: something else.
+    """
+    value = _value(config, key)
+    if isinstance(value, str):
+        try:
+            value = ast.literal_eval(value)
+        except (ValueError, SyntaxError) as error:
+            raise ConfigError(key, "height and width", repr(value), "Write e.g. [120, 160].") from error
+    if value is None:
+        return None
+    if isinstance(value, (list, tuple)) and len(value) == 2 and all(type(n) is int and n > 0 for n in value):
+        return value[0], value[1]
+    raise ConfigError(key, "height and width", repr(value), "Write e.g. [120, 160].")
+
+
+def choose_execution(execution: Any, temporal_agg: bool | None) -> str | int:
+    """How chunks are executed, also where it is said in the words of ACT's evaluators.
+
+    Args:
+        execution: `aggregate`, `aggregate-variance`, `chunk`, or a number of steps; nothing means `aggregate`.
+        temporal_agg: false without a number of steps means whole chunks, as in ACT; None leaves it to `execution`.
+
+    Raises:
+        ConfigError: aggregation and a number of steps.
+    """
+    chosen = AGGREGATE if str(execution).strip().lower() in NOTHING else str(execution).strip()
+    averages = chosen in (AGGREGATE, AGGREGATE_VARIANCE)
+    if temporal_agg is False and averages:
+        return WHOLE_CHUNKS
+    if temporal_agg and not averages:
+        fix = "Leave out `temporal_agg`, or set `execution` to `aggregate`."
+        raise ConfigError("temporal_agg", f"false, as `execution` is {chosen}", "true", fix)
+    return int(chosen) if chosen.isdigit() else chosen
+
+
+def _value(config: Mapping[str, Any], key: str) -> Any:
+    value = config.get(key)
+    return None if isinstance(value, str) and value.strip().lower() in NOTHING else value
