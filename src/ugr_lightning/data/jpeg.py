@@ -1,11 +1,15 @@
-"""JPEG frames in RoboTwin's colour order (FACTS 1.4): true RGB in memory, red and blue swapped on disk."""
+"""JPEG frames of RoboTwin and XPolicyLab (FACTS 1.4): true RGB in memory, red and blue swapped on disk or not.
+
+A JPEG with a comment segment `XPL-RGB1` stores true RGB, as every viewer expects; one without is swapped. The rule
+belongs to each picture and not to a file: both kinds may be in one data set.
+"""
 
 import numpy as np
 import simplejpeg
 
 QUALITY = 95
-RGB_MARKER = b"XPL-RGB1"  # comment segment of files whose JPEG stores true RGB
-COMMENT = b"\xff\xfe"
+RGB_MARKER = b"XPL-RGB1"
+_COMMENT, _SCAN, _WITHOUT_LENGTH = 0xFE, 0xDA, {0x01, *range(0xD0, 0xD9)}  # codes of segments
 
 
 def encode_jpeg(image: np.ndarray) -> bytes:
@@ -30,6 +34,31 @@ def encode_frame(images: np.ndarray) -> tuple[bytes, ...]:
     return tuple(encode_jpeg(image) for image in images)
 
 
+def stores_rgb(data: bytes) -> bool:
+    """Whether a JPEG is marked as true RGB; without the mark it is channel-swapped.
+
+    Only comment segments before the picture count, not the same bytes somewhere else.
+
+    Args:
+        data: any bytes; False for what is no JPEG.
+    """
+    at = 2
+    while data[at : at + 1] == b"\xff" and at + 1 < len(data):
+        code = data[at + 1]
+        if code == 0xFF:  # filling
+            at += 1
+        elif code in _WITHOUT_LENGTH:
+            at += 2
+        elif code == _SCAN:
+            return False
+        else:
+            length = int.from_bytes(data[at + 2 : at + 4], "big")
+            if code == _COMMENT and data[at + 4 : at + 2 + length] == RGB_MARKER:
+                return True
+            at += 2 + max(length, 2)
+    return False
+
+
 def jpeg_size(data: bytes) -> tuple[int, int]:
     """Height and width that a JPEG declares.
 
@@ -46,13 +75,13 @@ def decode_jpeg(data: bytes, out: np.ndarray) -> None:
     """Decode one stored frame to true RGB.
 
     Args:
-        data: JPEG from a demonstration file; a comment segment `XPL-RGB1` marks one that is not channel-swapped.
+        data: JPEG from a demonstration file, marked as true RGB or channel-swapped.
         out: (H, W, 3) uint8, contiguous; receives the picture.
 
     Raises:
         ValueError: damaged, or not of the size of `out`.
     """
-    colorspace = "RGB" if COMMENT + len(RGB_MARKER + b"..").to_bytes(2, "big") + RGB_MARKER in data else "BGR"
+    colorspace = "RGB" if stores_rgb(data) else "BGR"
     if jpeg_size(data) != out.shape[:2]:
         raise ValueError(f"a picture of {jpeg_size(data)}, not {out.shape[:2]}")
     simplejpeg.decode_jpeg(data, colorspace=colorspace, buffer=out)
