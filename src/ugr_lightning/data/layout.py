@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from ugr_lightning.contract import STATE_DIM
+from ugr_lightning.contract import CAMERAS, STATE_DIM
 from ugr_lightning.errors import ConfigError, DataError
 
 Vector = Literal["state", "action"]
@@ -160,8 +160,9 @@ def known_cameras(available: Sequence[str], names: Mapping[str, str]) -> dict[st
 
 
 def policy_cameras(available: Sequence[str], names: Mapping[str, str]) -> tuple[str, ...]:
-    """The cameras of a file by the policy's names; arguments as for `known_cameras`."""
-    return tuple(camera for camera, there in known_cameras(available, names).items() if there in available)
+    """The cameras of a file by the policy's names, ours in our order first; arguments as for `known_cameras`."""
+    found = [camera for camera, there in known_cameras(available, names).items() if there in available]
+    return (*(camera for camera in CAMERAS if camera in found), *(c for c in found if c not in CAMERAS))
 
 
 DEFAULT_LAYOUT = Layout()
