@@ -37,3 +37,16 @@ def call(function: Callable[..., int], command: str, argv: Sequence[str]) -> int
         raise explain(error, parser) from None
     given = {name: options[name] for name in inspect.signature(function).parameters}
     return function(**given)
+
+
+def name_leading(argv: Sequence[str], names: Sequence[str]) -> list[str]:
+    """Give the arguments that come before the first option the names of options: `A B --x 1` is `--a A --b B --x 1`.
+
+    Args:
+        argv: what follows the subcommand.
+        names: of the options, in order.
+    """
+    count = next((i for i, argument in enumerate(argv) if argument.startswith("-")), len(argv))
+    leading = list(argv[: min(count, len(names))])
+    named = [part for name, value in zip(names, leading, strict=False) for part in (f"--{name}", value)]
+    return named + list(argv[len(leading) :])

@@ -23,11 +23,13 @@ def _inspect(path: str, picture: str | None = None) -> int:
     """Say what a checkpoint, an episode or a folder is.
 
     Args:
-        path: a `.ckpt` file, an `.hdf5` episode, a folder of demonstrations, or a folder of runs.
+        path: a `.ckpt` file, an exported folder, an `.hdf5` episode, a folder of demonstrations, or a folder of runs.
         picture: for an episode, where its contact sheet goes; null means `<episode>.png` in the working folder.
     """
     place = Path(path)
-    if place.is_dir():
+    if (place / "model.safetensors").is_file():
+        lines = _checkpoint(place)
+    elif place.is_dir():
         lines = _recording(place) or _runs(place)
     elif place.suffix == ".hdf5":
         lines = _episode(place, Path(picture or f"{place.stem}.png"))

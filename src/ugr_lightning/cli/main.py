@@ -25,6 +25,9 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("ugr_lightning.cli.replay:run", "execute recorded commands again and confirm the outcome"),
     "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
     "bridge": ("ugr_lightning.cli.bridge:run", "let RoboTwin or XPolicyLab evaluate a checkpoint"),
+    "import-act": ("ugr_lightning.cli.import_checkpoint:run", "make a checkpoint of one of the original ACT code's"),
+    "import-lerobot": ("ugr_lightning.cli.import_checkpoint:run", "make a checkpoint of one of lerobot's ACT policies"),
+    "export": ("ugr_lightning.cli.export:run", "write a checkpoint for other programs: act, safetensors, onnx, ..."),
     "bench": ("ugr_lightning.cli.commands:run", "measure speed on this machine"),
 }
 
@@ -51,7 +54,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     """
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] in ("-h", "--help", "help"):
-        print(FIRST_RUN + "\n".join(f"  {name:<10}{about}" for name, (_, about) in COMMANDS.items()))
+        print(FIRST_RUN + "\n".join(f"  {name:<16}{about}" for name, (_, about) in COMMANDS.items()))
         return 0
     try:
         return _run(arguments[0], arguments[1:])

@@ -33,7 +33,7 @@ def _rollout(
 
     Args:
         task: a name from `ugr tasks`; null takes the task a checkpoint was trained on.
-        policy: `zero`, `random`, `expert`, or a checkpoint file.
+        policy: `zero`, `random`, `expert`, a checkpoint file, or a folder from `ugr export --to safetensors`.
         seeds: `evaluation` (the task's fixed list), `selection` (for choices of a recipe), or the first seed.
         episodes: how many of those seeds; null means 100, or 1 where only a video is asked for.
         execution: `aggregate`; `aggregate-variance`, which also weights by the predicted variance; or the number of
@@ -109,6 +109,7 @@ def roll_out(
     from ugr_lightning.sim.render import require_rendering
     from ugr_lightning.sim.seeds import seeds_hash
     from ugr_lightning.training.checkpoint import load_policy
+    from ugr_lightning.training.policy_folder import is_policy_folder
 
     actor: Actor
     trained: dict[str, object] = {}
@@ -118,7 +119,7 @@ def roll_out(
             raise ConfigError("--refine_ratio", "a checkpoint to refine less or more", policy, "Give one by --policy.")
         actor = make_actor(policy)
     else:
-        if not Path(policy).is_file() and not policy.endswith(".ckpt"):
+        if not Path(policy).is_file() and not is_policy_folder(Path(policy)) and not policy.endswith(".ckpt"):
             fix = "For a run's checkpoint use `ugr test --run NAME`, or give the file."
             raise ConfigError("--policy", f"one of {', '.join(DUMMIES)}, or a checkpoint file", policy, fix)
         model, info = load_policy(policy)
@@ -226,7 +227,7 @@ def _test(
     """Success of a checkpoint on the task's evaluation seeds, with aggregated chunks and with executed ones.
 
     Args:
-        ckpt_path: `best`, `best_loss`, `last`, or a checkpoint file.
+        ckpt_path: `best`, `best_loss`, `last`, a checkpoint file, or a folder from `ugr export --to safetensors`.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         task: a name from `ugr tasks`; null takes the task the checkpoint was trained on.
@@ -246,7 +247,8 @@ def _test(
     results = []
     with Runners() as simulators:
         for execution in executions:
-            file = Path(out) if out else checkpoint.with_name("evaluation.jsonl")
+            beside = checkpoint if checkpoint.is_dir() else checkpoint.parent
+            file = Path(out) if out else beside / "evaluation.jsonl"
             results += roll_out(
                 str(checkpoint),
                 task,

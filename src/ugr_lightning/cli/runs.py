@@ -29,7 +29,7 @@ def resolve_checkpoint(which: str, run: str, root: Path) -> Path:
     """The checkpoint file that a name means.
 
     Args:
-        which: `best` (of the run's monitor), `best_loss`, `last`, or the path of a file.
+        which: `best` (of the run's monitor), `best_loss`, `last`, or the path of a file or of an exported folder.
         run: a run's name under `root` (its newest version that has such a file) or the folder of one run.
         root: where runs are kept.
 
@@ -37,7 +37,7 @@ def resolve_checkpoint(which: str, run: str, root: Path) -> Path:
         CheckpointError: there is no such file. Nothing is ever trained or scored from fresh weights instead.
     """
     if which not in FILES:
-        if Path(which).is_file():
+        if Path(which).is_file() or (Path(which) / "model.safetensors").is_file():
             return Path(which)
         fix = f"Give a file, or one of {', '.join(FILES)} with --run."
         raise CheckpointError("--ckpt_path", "a checkpoint file", f"{which}, which is not there", fix)

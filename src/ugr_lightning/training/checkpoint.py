@@ -16,6 +16,7 @@ from lightning.pytorch.plugins.io import TorchCheckpointIO
 from ugr_lightning.blueprint import rebuild
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.errors import CheckpointError
+from ugr_lightning.training.policy_folder import folder_sha256, read_policy_folder
 
 FORMAT = 1
 _PREFIX = "policy."
@@ -124,7 +125,7 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
     """Rebuild a trained policy from one file, ready to predict.
 
     Args:
-        path: checkpoint file from `ugr fit`.
+        path: checkpoint file from `ugr fit`, or folder from `ugr export --to safetensors`.
         cameras: cameras the caller can provide; the policy's must be exactly these, in any order.
 
     Returns:
@@ -134,7 +135,7 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
         CheckpointError: not such a file, unsafe, of a newer format, or made for other cameras.
     """
     path = Path(path)
-    content = read_checkpoint(path)
+    content = read_policy_folder(path) if path.is_dir() else read_checkpoint(path)
     description = content.get("policy")
     if not isinstance(description, dict) or "state_dict" not in content:
         fix = "Use a checkpoint from `ugr fit`; foreign ones go through the bridges."
@@ -151,8 +152,29 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
     except RuntimeError as error:
         fix = "The code of the policy has changed since; check out the version named in the checkpoint."
         raise CheckpointError(path, "weights that fit the policy", str(error).splitlines()[-1].strip(), fix) from error
-    info = PolicyInfo(path, sha256(path), content.get("global_step", 0), content.get("epoch", 0), description)
+    digest = folder_sha256(path) if path.is_dir() else sha256(path)
+    info = PolicyInfo(path, digest, content.get("global_step", 0), content.get("epoch", 0), description)
     return policy.eval(), info
+
+
+def save_policy(
+    path: Path | str, policy: ChunkPolicy, data: dict[str, Any], extra: dict[str, Any] | None = None
+) -> None:
+    """Write a policy that was not trained here as a checkpoint that `load_policy` reads.
+
+    Args:
+        path: file to write.
+        policy: with its normalisation statistics.
+        data: what is known of its training data: `task`, `setting`, `image_size`, `state`.
+        extra: further entries of the checkpoint, tensors and plain containers.
+
+    Raises:
+        CheckpointError: the disk is full or read-only; what was there before is untouched.
+    """
+    state = {_PREFIX + name: value.detach().cpu().clone() for name, value in policy.state_dict().items()}
+    description = {**describe(policy, None), "data": plain(data)}
+    content = {"policy": description, "state_dict": state, "global_step": 0, "epoch": 0, **(extra or {})}
+    AtomicCheckpointIO().save_checkpoint(content, path)
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
