@@ -1,0 +1,224 @@
+"""Samples are written here with the keys, types and compression of ManiSkill's wrapper; one test uses the wrapper."""
+
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.formats import detect
+from ugr_lightning.data.formats.maniskill import ManiSkill
+from ugr_lightning.data.layout import Joint, Layout
+from ugr_lightning.errors import DataError
+
+FORMAT = ManiSkill()
+SIZE = (24, 32)
+
+
+def colour(camera, step):
+    return 200 - 10 * step, 40 + 50 * CAMERAS.index(camera), 20 + 5 * step
+
+
+def joints(steps, width=14, seed=0):
+    return np.random.default_rng(seed).normal(size=(steps, width)).astype(np.float32)
+
+
+def write(path, lengths=(5, 3, 7), mode="pd_joint_pos", width=14, qpos=14, pictures=True, skip=()):
+    """Trajectories of these many steps; observations have one more."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    episodes = []
+    with h5py.File(path, "w") as file:
+        for number, steps in enumerate(lengths):
+            if number in skip:
+                continue
+            group = file.create_group(f"traj_{number}", track_order=True)
+            group["obs/agent/qpos"] = joints(steps + 1, qpos, number)
+            for camera in CAMERAS if pictures else ():
+                frames = [np.full((*SIZE, 3), colour(camera, step), np.uint8) for step in range(steps + 1)]
+                rgb = f"obs/sensor_data/{camera}/rgb"
+                group.create_dataset(rgb, data=np.stack(frames), compression="gzip", compression_opts=5)
+            group["actions"] = joints(steps, width, 100 + number)
+            for name in ("terminated", "truncated", "success"):
+                group.create_dataset(name, data=np.arange(steps) == steps - 1, dtype=bool)
+            group["rewards"] = np.zeros(steps, np.float32)
+            about = {"episode_id": number, "episode_seed": 40 + number, "control_mode": mode, "elapsed_steps": steps}
+            episodes.append(about | {"reset_kwargs": {"options": None, "seed": 40 + number}, "success": True})
+    info = {"env_id": "Press-v1", "env_kwargs": {"obs_mode": "rgb"}, "max_episode_steps": 50}
+    path.with_suffix(".json").write_text(json.dumps({"env_info": info, "commit_info": None, "episodes": episodes}))
+    return path
+
+
+@pytest.fixture
+def recording(tmp_path):
+    write(tmp_path / "trajectory.h5")
+    return tmp_path
+
+
+def read(folder, index=0, cameras=CAMERAS, **layout):
+    return FORMAT.read(FORMAT.find(folder)[index], cameras, Layout(**layout))
+
+
+def test_trajectories_of_a_file_keep_their_numbers_and_seeds(tmp_path):
+    path = write(tmp_path / "20261122_101500.h5", lengths=(2,) * 12, skip={1, 5})
+    for place in (tmp_path, path):
+        assert detect(place).name == "maniskill"
+        found = FORMAT.find(place)
+        assert list(found) == [0, 2, 3, 4, 6, 7, 8, 9, 10, 11]
+        assert found[10].seed == 50
+    assert FORMAT.read(found[10], CAMERAS).name == "20261122_101500-traj_10"
+
+
+def test_trajectories_of_several_files_are_counted_through(tmp_path):
+    write(tmp_path / "b.h5", lengths=(4, 5))
+    write(tmp_path / "a.h5", lengths=(2, 3))
+    found = FORMAT.find(tmp_path)
+    assert [FORMAT.read(found[index], CAMERAS).length for index in range(4)] == [2, 3, 4, 5]
+
+
+def test_action_of_a_step_follows_its_observation_and_the_last_observation_is_dropped(recording):
+    episode = read(recording, 2)
+    np.testing.assert_array_equal(episode.state, joints(8, seed=2)[:7])
+    np.testing.assert_array_equal(episode.action, joints(7, seed=102))
+    np.testing.assert_array_equal(episode.proprioception("measured"), episode.state)
+    assert (episode.length, episode.seed) == (7, 42)
+    assert (episode.extras["control_mode"], episode.extras["environment"]) == ("pd_joint_pos", "Press-v1")
+    assert episode.extras["success"].tolist() == [False] * 6 + [True]
+
+
+def test_colours_are_right_to_the_bit_in_the_order_asked_for(recording):
+    cameras = ("cam_left_wrist", "cam_high")
+    episode = read(recording, 2, cameras)
+    for step in range(7):
+        assert [tuple(picture[3, 4]) for picture in episode.images(step)] == [colour(c, step) for c in cameras]
+
+
+def test_another_robot_is_read_through_a_layout(tmp_path):
+    write(tmp_path / "trajectory.h5", width=8, qpos=9)
+    with pytest.raises(DataError, match=r"actions.*14.*\(5, 8\)"):
+        read(tmp_path)
+    contents = FORMAT.peek(FORMAT.find(tmp_path)[0])
+    assert (set(contents.cameras), len(contents.state), len(contents.action)) == (set(CAMERAS), 9, 8)
+    layout = Layout(cameras={"top": "cam_high"}, state=9, action=(0, Joint(7, closed=-1, open=1)))
+    episode = FORMAT.read(FORMAT.find(tmp_path)[0], ("top",), layout)
+    np.testing.assert_allclose(episode.action[:, 1], (joints(5, 8, 100)[:, 7] + 1) / 2, atol=1e-6)
+
+
+@pytest.mark.parametrize("mode", ["pd_ee_delta_pose", "pd_joint_delta_pos", None])
+def test_actions_that_are_no_absolute_joint_targets_are_refused(mode, tmp_path):
+    write(tmp_path / "trajectory.h5", mode=mode)
+    with pytest.raises(DataError, match=rf"pd_joint_pos.*got {mode!r}.*replay_trajectory.*-c pd_joint_pos"):
+        read(tmp_path)
+
+
+def test_trajectories_without_pictures_say_how_to_get_them(tmp_path):
+    path = write(tmp_path / "trajectory.h5", pictures=False)
+    for case in ("joints only", "a flat state", "nothing"):
+        with h5py.File(path, "r+") as file:
+            if case != "joints only":
+                del file["traj_0/obs"]
+            if case == "a flat state":
+                file["traj_0/obs"] = np.zeros((6, 30), np.float32)
+        for use in (read, lambda folder: FORMAT.peek(FORMAT.find(folder)[0])):
+            with pytest.raises(DataError, match=r"traj_0.*rgb.*replay_trajectory.*-o rgb"):
+                use(tmp_path)
+
+
+def replace(key, *arguments, **options):
+    def damage(file):
+        del file[key]
+        file.create_dataset(key, *arguments, **options)
+
+    return damage
+
+
+def several_robots(file):
+    del file["traj_0/actions"]
+    file["traj_0/actions/left"] = joints(5)
+
+
+RGB = "traj_0/obs/sensor_data/cam_high/rgb"
+HOSTILE = {
+    "actions of several robots": (several_robots, "an array, got a group"),
+    "fewer actions than the JSON says": (replace("traj_0/actions", data=joints(4)), r"5 rows.*got 4"),
+    "no actions": (replace("traj_0/actions", data=joints(0)), r"5 rows.*got 0"),
+    "as many joints as actions": (replace("traj_0/obs/agent/qpos", data=joints(5)), r"qpos.*\(6, 14\).*\(5, 14\)"),
+    "NaN": (lambda file: file["traj_0/actions"].__setitem__((1, 2), np.nan), r"actions.*nan at \[1, 2\]"),
+    "fewer pictures": (replace(RGB, data=np.zeros((5, *SIZE, 3), np.uint8)), r"cam_high/rgb.*\(6, H, W, 3\)"),
+    "depth for colour": (replace(RGB, data=np.zeros((6, *SIZE, 1), np.uint16)), r"cam_high/rgb.*\(6, H, W, 3\)"),
+    "another size": (replace(RGB, data=np.zeros((6, 8, 8, 3), np.uint8)), "cameras of one size"),
+    "success as numbers": (replace("traj_0/success", data=np.zeros(5)), r"success.*booleans"),
+    "pictures outside": (lambda file: (file.pop(RGB), file.__setitem__(RGB, h5py.ExternalLink("/x", "y"))), "link"),
+}
+
+
+@pytest.mark.parametrize("case", HOSTILE)
+def test_damaged_content_is_one_clear_error(case, recording):
+    damage, message = HOSTILE[case]
+    path = recording / "trajectory.h5"
+    with h5py.File(path, "r+") as file:
+        damage(file)
+    with pytest.raises(DataError, match=message) as caught:
+        read(recording)
+    assert str(path) in str(caught.value)
+
+
+METADATA = {
+    "cut off": '{"episodes": [',
+    "a list": "[]",
+    "no episodes": '{"env_info": null}',
+    "episodes of another kind": '{"episodes": [1]}',
+    "episodes without numbers": '{"episodes": [{"episode_id": "one"}]}',
+    "numbers that cannot be": '{"episodes": [{"episode_id": []}]}',
+    "another episode": '{"episodes": [{"episode_id": 7}]}',
+    "deep": '{"episodes": ' + "[" * 100_000,
+}
+
+
+@pytest.mark.parametrize("case", METADATA)
+def test_damaged_metadata_are_a_clear_error(case, recording):
+    (recording / "trajectory.json").write_text(METADATA[case])
+    with pytest.raises(DataError, match=r"trajectory\.json"):
+        read(recording)
+
+
+def test_missing_metadata_are_a_clear_error(recording):
+    (recording / "trajectory.json").unlink()
+    assert FORMAT.recognises(recording)
+    with pytest.raises(DataError, match=r"trajectory\.json.*no such file"):
+        FORMAT.find(recording)
+
+
+def test_foreign_and_damaged_files_are_not_recognised(tmp_path):
+    assert not FORMAT.recognises(tmp_path / "nowhere")
+    good = write(tmp_path / "good" / "a.h5").read_bytes()
+    (tmp_path / "a.h5").write_bytes(good[:2000])
+    (tmp_path / "b.h5").write_bytes(b"text")
+    with h5py.File(tmp_path / "c.h5", "w") as file:
+        file["traj_x/actions"], file["traj_0/other"] = 1, 2
+    assert not FORMAT.recognises(tmp_path)
+
+
+@pytest.mark.renders
+def test_what_the_wrapper_records_from_an_environment_of_ours_is_read(tmp_path):
+    gymnasium = pytest.importorskip("gymnasium")
+    from mani_skill.utils.wrappers import RecordEpisode
+
+    import ugr_lightning.sim.environments  # noqa: F401
+    from ugr_lightning.sim.robot import HOME_ACTION
+
+    options = {"obs_mode": "rgb", "render_backend": "cpu", "image_size": (30, 40), "max_episode_steps": 6}
+    environment = gymnasium.make("UGR-ClickAlarmclock-v1", **options)
+    recorder = RecordEpisode(environment, str(tmp_path), trajectory_name="trajectory", save_video=False)
+    seen, told = [recorder.reset(seed=5)[0]], []
+    for step in range(4):
+        told.append(np.float32(HOME_ACTION) + np.float32(0.02 * step))
+        seen.append(recorder.step(told[-1])[0])
+    recorder.close()
+    episode = read(tmp_path)
+    np.testing.assert_array_equal(episode.action, told)
+    assert (episode.length, episode.seed, episode.image_size) == (4, 5, (30, 40))
+    for step, observation in enumerate(seen[:-1]):
+        np.testing.assert_allclose(episode.state[step], np.ravel(observation["agent"]["qpos"]), atol=1e-6)
+        for camera, picture in zip(CAMERAS, episode.images(step), strict=True):
+            np.testing.assert_array_equal(picture, observation["sensor_data"][camera]["rgb"][0].numpy())
