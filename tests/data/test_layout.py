@@ -75,13 +75,13 @@ def test_a_joint_that_is_not_there_is_named_beside_those_that_are(joint, names, 
     ],
 )
 def test_impossible_joints_are_refused(wrong):
-    with pytest.raises(ConfigError, match="data.layout, joint"):
+    with pytest.raises(ConfigError, match=r"data\.layout, joint"):
         Joint(**wrong)
 
 
 @pytest.mark.parametrize("nothing", [0, ()])
 def test_a_vector_has_at_least_one_joint(nothing):
-    with pytest.raises(ConfigError, match="data.layout.state"):
+    with pytest.raises(ConfigError, match=r"data\.layout\.state"):
         Layout(state=nothing)
 
 

@@ -2,6 +2,7 @@
 
 import os
 from abc import ABC, abstractmethod
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,10 @@ class FrameSource(ABC):
     def close(self) -> None:
         """Let go of the file; reading again opens it again."""
 
+    def jpegs(self, step: int) -> tuple[bytes, ...] | None:
+        """The JPEGs that decode to exactly the pictures of one step, one per camera; None where there are none."""
+        return None
+
     @property
     @abstractmethod
     def files(self) -> tuple[Path, ...]:
@@ -53,7 +58,7 @@ class Hdf5Frames(FrameSource):
 
     def __init__(self, path: Path, keys: tuple[str, ...], image_size: tuple[int, int]) -> None:
         self.path, self.keys, self.image_size = path, keys, image_size
-        self._opened: tuple[int, h5py.File, list[h5py.Dataset]] | None = None
+        self._opened: tuple[int, h5py.File, dict[str, h5py.Dataset]] | None = None
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_opened": None}
@@ -63,11 +68,13 @@ class Hdf5Frames(FrameSource):
         """The one file."""
         return (self.path,)
 
-    def _datasets(self) -> list[h5py.Dataset]:
+    def _dataset(self, key: str) -> h5py.Dataset:
         if self._opened is None or self._opened[0] != os.getpid():
-            file = h5py.File(self.path, "r")
-            self._opened = (os.getpid(), file, [file[key] for key in self.keys])
-        return self._opened[2]
+            self._opened = (os.getpid(), h5py.File(self.path, "r"), {})
+        _, file, datasets = self._opened
+        if key not in datasets:
+            datasets[key] = file[key]
+        return datasets[key]
 
     def close(self) -> None:
         """Close the file; the next read opens it again."""
@@ -75,14 +82,14 @@ class Hdf5Frames(FrameSource):
             self._opened[1].close()
         self._opened = None
 
-    def _rows(self, step: int) -> list[Any]:
-        """What the cameras' datasets hold for one step.
+    def _rows(self, step: int, keys: Sequence[str]) -> list[Any]:
+        """What some datasets hold for one step.
 
         Raises:
             DataError: the file changed or became unreadable after it was checked.
         """
         try:
-            return [dataset[step] for dataset in self._datasets()]
+            return [self._dataset(key)[step] for key in keys]
         except (OSError, RuntimeError, KeyError, ValueError, IndexError) as error:
             raise DataError(f"{self.path}[{step}]", "a stored frame", f"a read error ({error})", FIX) from error
 
@@ -96,7 +103,11 @@ class JpegFrames(Hdf5Frames):
         Raises:
             DataError: the file changed or became unreadable after it was checked.
         """
-        return tuple(bytes(row) for row in self._rows(step))
+        return tuple(bytes(row) for row in self._rows(step, self.keys))
+
+    def jpegs(self, step: int) -> tuple[bytes, ...]:
+        """The stored bytes."""
+        return self.encoded(step)
 
     def read(self, step: int, out: np.ndarray) -> None:
         """Decode one step into `out`.
@@ -113,7 +124,33 @@ class JpegFrames(Hdf5Frames):
 
 
 class RawFrames(Hdf5Frames):
-    """RGB frames as plain numbers in an HDF5 file, one dataset (T, H, W, 3) uint8 per camera."""
+    """RGB frames as plain numbers in an HDF5 file, one dataset (T, H, W, 3) uint8 per camera.
+
+    Args:
+        path, keys, image_size: as for `Hdf5Frames`.
+        origins: one dataset per camera of the JPEGs that the frames were decoded from; empty where not kept.
+    """
+
+    def __init__(
+        self, path: Path, keys: tuple[str, ...], image_size: tuple[int, int], origins: tuple[str, ...] = ()
+    ) -> None:
+        super().__init__(path, keys, image_size)
+        self.origins = origins
+
+    def jpegs(self, step: int) -> tuple[bytes, ...] | None:
+        """The JPEGs that were kept, if the frames still are what they decode to."""
+        if not self.origins:
+            return None
+        kept = tuple(bytes(row) for row in self._rows(step, self.origins))
+        decoded = np.empty((*self.image_size, 3), np.uint8)
+        for jpeg, row in zip(kept, self._rows(step, self.keys), strict=True):
+            try:
+                decode_jpeg(jpeg, decoded)
+            except ValueError:
+                return None
+            if not np.array_equal(decoded, row):
+                return None
+        return kept
 
     def read(self, step: int, out: np.ndarray) -> None:
         """Copy one step into `out`.
@@ -121,7 +158,7 @@ class RawFrames(Hdf5Frames):
         Raises:
             DataError: the file changed or became unreadable after it was checked.
         """
-        for row, picture in zip(self._rows(step), out, strict=True):
+        for row, picture in zip(self._rows(step, self.keys), out, strict=True):
             picture[:] = row
 
 

@@ -135,8 +135,8 @@ def test_a_recording_converted_to_a_processed_file_is_the_same_to_the_bit(tmp_pa
     for step in range(given.length):
         assert np.array_equal(back.images(step), given.images(step))
     with h5py.File(tmp_path / "act" / "episode_0.hdf5") as file:
-        assert sorted(file) == ["action", "observations"]
-        assert len(file.attrs) == 0
+        assert sorted(file) == ["action", "observations", "ugr"]
+        assert "sim" not in file.attrs
         assert sorted(file["observations"]) == ["images", "left_arm_dim", "qpos", "right_arm_dim"]
         assert file["observations/left_arm_dim"][()].tolist() == [6] * 12
         assert file["observations/left_arm_dim"].dtype == np.int64
@@ -147,13 +147,35 @@ def test_a_recording_converted_to_a_processed_file_is_the_same_to_the_bit(tmp_pa
             assert (pictures.shape, pictures.dtype, pictures.chunks) == ((12, 24, 32, 3), np.uint8, None)
 
 
-def test_a_processed_file_converted_to_a_recording_keeps_joints_to_the_bit_and_pictures_within_the_codecs_bound(
+def test_a_recording_goes_to_a_processed_file_and_back_without_loss(tmp_path, episode_file):
+    given = read_episode(episode_file)
+    find_format("act").write(tmp_path / "act", [given])
+    find_format("robotwin").write(tmp_path / "back", [_read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)])
+    assert detect(tmp_path / "back").name == "robotwin"
+    back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
+    assert (back.seed, back.length) == (given.seed, given.length)
+    assert np.array_equal(back.state, given.state)
+    assert np.array_equal(back.action, given.action)
+    assert [back.frames.encoded(step) for step in range(12)] == [given.frames.encoded(step) for step in range(12)]
+
+
+def test_jpegs_that_no_longer_match_the_frames_are_not_used(tmp_path, episode_file):
+    find_format("act").write(tmp_path / "act", [read_episode(episode_file)])
+    with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
+        file["observations/images/cam_high"][3] = 200
+    find_format("robotwin").write(tmp_path / "back", [_read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)])
+    back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
+    assert np.abs(back.images(3)[0].astype(int) - 200).max() <= 2
+
+
+def test_a_processed_file_of_others_converted_to_a_recording_keeps_joints_to_the_bit_and_pictures_within_a_bound(
     tmp_path, episode_file
 ):
     find_format("act").write(tmp_path / "act", [read_episode(episode_file)])
+    with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
+        del file["ugr"]
     given = _read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)
     find_format("robotwin").write(tmp_path / "back", [given])
-    assert detect(tmp_path / "back").name == "robotwin"
     back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
     assert np.array_equal(back.state, given.state)
     assert np.array_equal(back.action, given.action)
@@ -179,6 +201,8 @@ def test_velocities_that_were_not_recorded_are_differences_of_the_joints(tmp_pat
     back = _read(tmp_path / "original" / "episode_0.hdf5", PROCESSED)
     assert np.allclose(back.extras["qvel"][4], (given.measured[4] - given.measured[3]) * 25, rtol=1e-5)
     find_format("act").write(tmp_path / "act", [given])
+    with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
+        del file.attrs["control_hz"]
     without_rate = _read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)
     with pytest.raises(DataError, match="control_hz"):
         find_format("original-act").write(tmp_path / "again", [without_rate])

@@ -1,6 +1,7 @@
 """Demonstration files survive the round trip, and nothing damaged or foreign gets past the reader."""
 
 import io
+from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -9,9 +10,10 @@ from PIL import Image
 
 from ugr_lightning.contract import CAMERAS
 from ugr_lightning.data.folder import episode_path
-from ugr_lightning.data.formats import robotwin
+from ugr_lightning.data.formats import detect, find_format, robotwin
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
 from ugr_lightning.data.jpeg import encode_frame, encode_jpeg
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import ConfigError, DataError
 
 VECTOR = "joint_action/vector"
@@ -325,6 +327,85 @@ def test_overwritten_bytes_never_give_anything_but_a_data_error(episode_file):
         else:
             outcomes.append("unharmed")
     assert set(outcomes) == {"refused", "unharmed"}
+
+
+def _theirs(folder, spelling, frames=6, arm=6, count=3):
+    """As RoboTwin's own collector leaves it: a true RGB array handed to an encoder that takes it for BGR."""
+    for index in range(count):
+        vector = np.random.default_rng(index).normal(size=(frames, 2 * arm + 2))
+        path = folder / "data" / spelling.format(i=index)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with h5py.File(path, "w") as file:
+            for side, start in (("left", 0), ("right", arm + 1)):
+                file[f"joint_action/{side}_arm"] = vector[:, start : start + arm]
+                file[f"joint_action/{side}_gripper"] = vector[:, start + arm]
+                file[f"endpose/{side}_endpose"] = np.zeros((frames, 7))
+                file[f"endpose/{side}_gripper"] = vector[:, start + arm]
+            file["joint_action/vector"] = vector
+            for view, camera in enumerate(("front_camera", "head_camera", "left_camera", "right_camera")):
+                stored = []
+                for frame in range(frames):
+                    rgb = np.zeros((24, 32, 3), np.uint8)
+                    rgb[:] = (200, 20 * frame, 60 * view)
+                    buffer = io.BytesIO()
+                    Image.fromarray(rgb[..., ::-1]).save(buffer, "JPEG", quality=95)  # red and blue swapped
+                    stored.append(buffer.getvalue())
+                longest = max(map(len, stored))
+                file.create_dataset(f"observation/{camera}/rgb", data=stored, dtype=f"S{longest}")
+            file["pointcloud"] = np.zeros((frames, 0))
+    (folder / "seed.txt").write_text("4 9 11")
+    return folder
+
+
+@pytest.mark.parametrize("spelling", ["episode{i}.hdf5", "episode_{i}.hdf5", "episode_{i:07d}.hdf5"])
+def test_robotwins_own_episodes_are_read_under_all_their_spellings(spelling, tmp_path):
+    form = detect(_theirs(tmp_path, spelling))
+    assert form.name == "robotwin"
+    found = form.find(tmp_path)
+    assert list(found) == [0, 1, 2]
+    assert form.peek(found[1]).cameras == (*CAMERAS, "front_camera")
+    vector = np.random.default_rng(1).normal(size=(6, 14)).astype(np.float32)
+    episode = form.read(found[1], (*CAMERAS, "front_camera"))
+    assert (episode.length, episode.seed, episode.measured) == (5, 9, None)
+    assert np.array_equal(episode.state, vector[:-1])
+    assert np.array_equal(episode.action, vector[1:])
+    for step in (0, 4):
+        blue = [picture[12, 16, 2] for picture in episode.images(step).astype(int)]
+        assert blue == pytest.approx([60, 180, 120, 0], abs=4)  # head, right, left, front
+        assert episode.images(step)[0, 12, 16, :2].astype(int).tolist() == pytest.approx([200, 20 * step], abs=4)
+
+
+def test_seven_joints_per_arm_are_named_and_picked(tmp_path):
+    form = detect(_theirs(tmp_path, "episode{i}.hdf5", arm=7))
+    location = form.find(tmp_path)[0]
+    vector = np.random.default_rng(0).normal(size=(6, 16)).astype(np.float32)
+    names = form.peek(location).state
+    assert (len(names), names[6:9]) == (16, ("left_joint_7", "left_gripper", "right_joint_1"))
+    with pytest.raises(DataError, match=r"\(T, 14\).*\(6, 16\)"):
+        form.read(location, CAMERAS)
+    whole = form.read(location, CAMERAS, form.peek(location).layout)
+    assert np.array_equal(whole.state, vector[:-1])
+    right = tuple(name for name in names if name.startswith("right"))
+    one_arm = form.read(location, ("cam_right_wrist",), Layout(state=right))
+    assert np.array_equal(one_arm.state, vector[:-1, 8:])
+    assert np.array_equal(one_arm.action, vector[1:, 8:])
+
+
+def test_a_recording_is_rewritten_in_the_same_bytes_of_pictures_and_numbers(tmp_path, episode_file):
+    given = read_episode(episode_file)
+    find_format("robotwin").write(tmp_path / "again", [given])
+    again = read_episode(episode_path(tmp_path / "again", 0))
+    assert np.array_equal(again.state, given.state)
+    assert np.array_equal(again.action, given.action)
+    assert [again.frames.encoded(t) for t in range(12)] == [given.frames.encoded(t) for t in range(12)]
+    assert (again.seed, again.extras["task"], again.extras["control_hz"]) == (0, "click_alarmclock", 25.0)
+
+
+def test_an_episode_of_one_arm_cannot_be_written(tmp_path, episode_file):
+    given = replace(read_episode(episode_file), state=np.zeros((12, 7), "f4"), action=np.zeros((12, 7), "f4"))
+    with pytest.raises(DataError, match=r"two arms, each with a gripper.*got 7 states, 7 actions"):
+        find_format("robotwin").write(tmp_path / "again", [given])
+    assert not list((tmp_path / "again").rglob("*.hdf5"))
 
 
 def test_a_missing_file_says_so(tmp_path):

@@ -1,6 +1,7 @@
 """Processed ACT HDF5, as RoboTwin's ACT trains on it (FACTS 1.5): joints, commands and plain RGB frames per episode.
 
-The original ACT's files (`original_act.py`) have the same keys and some more.
+The original ACT's files (`original_act.py`) have the same keys and some more. Ours have the attributes of our
+recordings and the frames' JPEGs as well, where there are any; other readers do not look at them.
 """
 
 from collections.abc import Sequence
@@ -11,12 +12,14 @@ import numpy as np
 
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import Contents, EpisodeLocation, NumberedFiles
-from ugr_lightning.data.frames import RawFrames, check_raw
+from ugr_lightning.data.formats.robotwin import read_about, write_about
+from ugr_lightning.data.frames import RawFrames, check_jpegs, check_raw
 from ugr_lightning.data.hdf5 import FIX, has_key, list_keys, open_hdf5, read_array
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout, policy_cameras
 from ugr_lightning.errors import DataError
 
 QPOS, ACTION, IMAGES = "observations/qpos", "action", "observations/images"
+ORIGINS = "ugr/jpeg"  # ours: the JPEGs that the frames were decoded from
 TWO_ARMS = 12  # a vector of even length from here on is two arms, each with a gripper last
 
 
@@ -54,15 +57,19 @@ class ProcessedAct(NumberedFiles):
             sizes = [check_raw(file, key, len(state)) for key in keys]
             if len(set(sizes)) > 1:
                 raise DataError(f"{path}:{IMAGES}", "cameras of one size", sizes, "Choose cameras of one size.")
+            origins = tuple(f"{ORIGINS}/{view}" for view in views) if has_key(file, ORIGINS) else ()
+            for key in origins:
+                check_jpegs(file, key, len(state))
             measured, extras = self._read_further(file, state)
+            extras |= read_about(file)
         return Episode(
             path=path,
             cameras=tuple(cameras),
             state=layout.take(state, "state", (), f"{path}:{QPOS}"),
             action=layout.take(action, "action", (), f"{path}:{ACTION}"),
-            frames=RawFrames(path, keys, sizes[0]),
+            frames=RawFrames(path, keys, sizes[0], origins),
             measured=None if measured is None else layout.take(measured, "state", (), f"{path}:{QPOS}"),
-            seed=location.seed,
+            seed=extras.pop("seed", location.seed),
             extras=extras,
         )
 
@@ -71,7 +78,11 @@ class ProcessedAct(NumberedFiles):
         return None, {}
 
     def fill(self, file: h5py.File, episode: Episode) -> None:
-        """Write one episode, its frames one at a time at the size they have."""
+        """Write one episode, its frames one at a time at the size they have.
+
+        JPEGs that they come from are kept beside them, about a tenth more, so that the way back loses nothing.
+        """
+        write_about(file, episode)
         file[ACTION], file[QPOS] = episode.action, episode.state  # (T, A) and (T, S) float32
         self._write_further(file, episode)
         pictures = []
@@ -79,9 +90,14 @@ class ProcessedAct(NumberedFiles):
             shape = (episode.length, *episode.image_size, 3)
             chunks = (1, *shape[1:]) if self.chunked else None
             pictures.append(file.create_dataset(f"{IMAGES}/{camera}", shape, np.uint8, chunks=chunks))
+        jpegs = [episode.frames.jpegs(step) for step in range(episode.length)]
         for step in range(episode.length):
             for dataset, picture in zip(pictures, episode.images(step), strict=True):
                 dataset[step] = picture
+        kept = [step for step in jpegs if step is not None]
+        if len(kept) == episode.length:
+            for view, camera in enumerate(episode.cameras):
+                file[f"{ORIGINS}/{camera}"] = np.array([step[view] for step in kept], dtype=bytes)
 
     def _write_further(self, file: h5py.File, episode: Episode) -> None:
         """The number of joints of each arm in every row, as RoboTwin's converter leaves it."""

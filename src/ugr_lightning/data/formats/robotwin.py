@@ -299,14 +299,12 @@ class RoboTwin(NumberedFiles):
             expected = "two arms, each with a gripper, in states and actions alike"
             raise DataError(episode.path, expected, got, "Convert to `act` instead.")
         vector = np.concatenate([episode.state, episode.action[-1:]]).astype(np.float64)  # (T + 1, S)
-        for name in _ATTRIBUTES:
-            value = episode.seed if name == "seed" else episode.extras.get(name)
-            if value is not None:
-                file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
+        write_about(file, episode)
         _write_joints(file, vector)
         if not np.array_equal(vector[1:], episode.action):
             file["ugr/expert_action"] = episode.action
-        jpegs = [_jpegs(episode, step) for step in range(episode.length)]
+        steps = range(episode.length)
+        jpegs = [episode.frames.jpegs(step) or encode_frame(episode.images(step)) for step in steps]
         for view, camera in enumerate(episode.cameras):
             frames = [step[view] for step in [*jpegs, jpegs[-1]]]
             file[f"observation/{DISK_CAMERAS.get(camera, camera)}/rgb"] = np.array(frames, dtype=bytes)
@@ -320,13 +318,6 @@ def _write_joints(file: h5py.File, vector: np.ndarray) -> None:
         file[f"joint_action/{side}_arm"] = vector[:, start : start + half - 1]
         file[f"joint_action/{side}_gripper"] = vector[:, start + half - 1]
     file[VECTOR] = vector
-
-
-def _jpegs(episode: Episode, step: int) -> tuple[bytes, ...]:
-    """The pictures of one step as RoboTwin stores them; JPEGs are passed on as they are."""
-    if isinstance(episode.frames, JpegFrames):
-        return episode.frames.encoded(step)
-    return encode_frame(episode.images(step))
 
 
 class Executed(NamedTuple):
@@ -378,6 +369,16 @@ def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
         extras["slack"] = read_array(file, "ugr/slack", (frames - 1,))
     if has_key(file, "ugr/phase"):
         extras["phase"] = read_strings(file, "ugr/phase", frames - 1)
+    return extras | read_about(file)
+
+
+def read_about(file: h5py.File) -> dict[str, Any]:
+    """What the attributes of a file of ours say about the episode; empty for the files of others.
+
+    Raises:
+        DataError: a value of another type, or a file of the future.
+    """
+    about: dict[str, Any] = {}
     written = read_attribute(file, "ugr_format_version")
     if written not in (None, FORMAT_VERSION):
         got = f"version {written}"
@@ -388,5 +389,13 @@ def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
             continue
         if not isinstance(value, kind):
             raise DataError(f"{file.filename}:@{name}", kind.__name__, repr(value)[:80], FIX)
-        extras[name] = value
-    return extras
+        about[name] = value
+    return about
+
+
+def write_about(file: h5py.File, episode: Episode) -> None:
+    """Write what is known about an episode for `read_about`."""
+    for name in _ATTRIBUTES:
+        value = episode.seed if name == "seed" else episode.extras.get(name)
+        if value is not None:
+            file.attrs[name] = np.bytes_(value.encode()) if isinstance(value, str) else value
