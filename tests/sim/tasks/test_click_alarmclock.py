@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ugr_lightning.sim.scene import Touch
-from ugr_lightning.sim.tasks.click_alarmclock import X_RANGE, Y_RANGE
+from ugr_lightning.sim.tasks.click_alarmclock import BUTTON_RADIUS, FEET, MODELS, TOUCH_RADIUS, X_RANGE, Y_RANGE
 
 
 @pytest.fixture
@@ -72,3 +72,16 @@ def test_clocks_stand_within_the_ranges_on_both_sides(click):
     assert ((np.abs(x) >= X_RANGE[0]) & (np.abs(x) <= X_RANGE[1])).all()
     assert ((y >= Y_RANGE[0]) & (y <= Y_RANGE[1])).all()
     assert 4 < (x > 0).sum() < 16
+
+
+def test_both_clocks_occur_and_their_buttons_have_their_own_height(click):
+    scenes = [(click.reset(seed), click.scene_info())[1] for seed in range(12)]
+    assert {scene["model"] for scene in scenes} == set(MODELS)
+    for scene in scenes:
+        assert scene["button"][2] == MODELS[scene["model"]].button
+
+
+def test_a_touch_near_the_button_is_a_touch_of_the_clock_on_both_models():
+    for model in MODELS.values():
+        assert min(model.size[:2]) / 2.0 >= TOUCH_RADIUS > BUTTON_RADIUS
+        assert model.button - FEET - model.size[2] < TOUCH_RADIUS

@@ -1,13 +1,13 @@
 """Press the button on top of an alarm clock with the closed gripper of the arm on its side of the table."""
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ugr_lightning.sim.expert import Arms, ExpertStep, facing, gripper_down
 from ugr_lightning.sim.kinematics import UP, TcpPose, rotation_z
-from ugr_lightning.sim.objects import Prop, pose_of
+from ugr_lightning.sim.objects import Colour, Prop, pose_of
 from ugr_lightning.sim.scene import TwoArmEnv, side_of
 
 # Success (FACTS 9): the gripper is commanded closed and touches the clock near the button point.
@@ -18,41 +18,64 @@ TOUCH_RADIUS = 0.03
 X_RANGE = (0.05, 0.25)  # to the left or to the right of the middle
 Y_RANGE = (-0.2, 0.0)
 
-BUTTON_HEIGHT = 0.106  # top of the button above the table
 BUTTON_RADIUS = 0.022
-BODY = (0.10, 0.065, 0.078)  # flat on top, so that a touch within 3 cm of the button's middle is a touch of the clock
 FEET = 0.014
 FINGERTIP = 0.014  # fingertips beyond the TCP
 HOVER = 0.07  # fingertips above the button before they go straight down
 PRESS_DEPTH = 0.018  # commanded below the button's top, and below the body's: a policy's millimetres do not matter
 
 
+BLACK, WHITE, YELLOW = (0.04, 0.04, 0.05), (0.97, 0.97, 0.93), (1.0, 0.85, 0.05)
+
+
+class Model(NamedTuple):
+    """One of the two clocks.
+
+    The body is flat on top, so that a touch within 3 cm of the button's middle is a touch of the clock.
+
+    Args:
+        size: width, depth and height of the body in metres, feet excluded.
+        button: height of the button's top above the table, m.
+        colour: of the body.
+        hands: whether it has a dial with hands, or a display with digits.
+    """
+
+    size: tuple[float, float, float]
+    button: float
+    colour: Colour
+    hands: bool
+
+
+MODELS = {
+    "analogue": Model(size=(0.10, 0.065, 0.078), button=0.106, colour=(0.80, 0.10, 0.12), hands=True),
+    "digital": Model(size=(0.12, 0.070, 0.068), button=0.096, colour=(0.10, 0.42, 0.62), hands=False),
+}
+
+
 class ClickAlarmclock(TwoArmEnv):
-    """An alarm clock with a large button on top; either arm, straight down."""
+    """One of two alarm clocks with a large button on top; either arm, straight down."""
 
     horizon = 200
-    version = 2
+    version = 3
 
     def build(self, rng: np.random.Generator) -> None:
-        """Place the clock on either side, turned any way."""
+        """Place one of the clocks on either side, turned any way."""
         x = rng.uniform(*X_RANGE) * rng.choice([-1.0, 1.0])
         y, self.yaw = rng.uniform(*Y_RANGE), rng.uniform(-np.pi, np.pi)
-        self.button_point = np.array([x, y, BUTTON_HEIGHT])
+        self.model_name = str(rng.choice(sorted(MODELS)))
+        model = MODELS[self.model_name]
+        self.button_point = np.array([x, y, model.button])
         pose = pose_of((x, y, 0.0), rotation_z(self.yaw))
-        red, white, black, yellow = (0.80, 0.10, 0.12), (0.97, 0.97, 0.93), (0.04, 0.04, 0.05), (1.0, 0.85, 0.05)
         clock = Prop(self.scene)
-        middle, front = FEET + BODY[2] / 2.0, -BODY[1] / 2.0
-        clock.box(BODY, (0.0, 0.0, middle), red)
-        clock.cylinder(0.034, 0.002, (0.0, front, middle), white, axis="y", solid=False)
-        clock.box((0.005, 0.001, 0.024), (0.0, front - 0.0015, middle + 0.010), black, solid=False)
-        clock.box((0.020, 0.001, 0.005), (0.009, front - 0.0015, middle), black, solid=False)
+        clock.box(model.size, (0.0, 0.0, FEET + model.size[2] / 2.0), model.colour)
         for sign in (-1.0, 1.0):
-            clock.box((0.018, 0.055, FEET), (0.035 * sign, 0.0, FEET / 2.0), black)
+            clock.box((0.018, 0.055, FEET), (0.35 * model.size[0] * sign, 0.0, FEET / 2.0), BLACK)
+        (_add_dial if model.hands else _add_display)(clock, model)
         clock.build("alarm_clock", pose, static=True)
-        height = BUTTON_HEIGHT - FEET - BODY[2]
-        Prop(self.scene).cylinder(BUTTON_RADIUS, height, (0.0, 0.0, BUTTON_HEIGHT - height / 2.0), yellow).build(
-            "alarm_button", pose, static=True
-        )
+        button = Prop(self.scene)
+        height = model.button - FEET - model.size[2]
+        button.cylinder(BUTTON_RADIUS, height, (0.0, 0.0, model.button - height / 2.0), YELLOW)
+        button.build("alarm_button", pose, static=True)
 
     def condition(self) -> bool:
         """The closed gripper on the clock's side touches it near the button point."""
@@ -77,5 +100,31 @@ class ClickAlarmclock(TwoArmEnv):
         yield from arms.hold(8, phase="hold")
 
     def describe(self) -> dict[str, Any]:
-        """Button point and the clock's yaw."""
-        return {"button": self.button_point.tolist(), "yaw": float(self.yaw), "side": side_of(self.button_point[0])}
+        """Which clock, its button point, yaw and side."""
+        side = side_of(self.button_point[0])
+        return {"model": self.model_name, "button": self.button_point.tolist(), "yaw": float(self.yaw), "side": side}
+
+
+def _add_dial(clock: Prop, model: Model) -> None:
+    front, middle = -model.size[1] / 2.0, FEET + model.size[2] / 2.0
+    clock.cylinder(0.034, 0.002, (0.0, front, middle), WHITE, axis="y", solid=False)
+    clock.box((0.005, 0.001, 0.024), (0.0, front - 0.0015, middle + 0.010), BLACK, solid=False)
+    clock.box((0.020, 0.001, 0.005), (0.009, front - 0.0015, middle), BLACK, solid=False)
+
+
+def _add_display(clock: Prop, model: Model) -> None:
+    """A dark display that reads 7:00."""
+    front, middle = -model.size[1] / 2.0, FEET + model.size[2] / 2.0
+    clock.box((0.096, 0.002, 0.044), (0.0, front, middle), BLACK, solid=False)
+
+    def bar(width: float, height: float, x: float, z: float) -> None:
+        clock.box((width, 0.001, height), (x, front - 0.0015, middle + z), (1.0, 0.35, 0.20), solid=False)
+
+    bar(0.016, 0.004, -0.034, 0.013)
+    bar(0.004, 0.030, -0.028, 0.0)
+    for z in (-0.007, 0.007):
+        bar(0.004, 0.004, -0.013, z)
+    for x in (0.004, 0.030):
+        for sign in (-1.0, 1.0):
+            bar(0.016, 0.004, x, 0.013 * sign)
+            bar(0.004, 0.030, x + 0.006 * sign, 0.0)
