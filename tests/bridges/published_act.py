@@ -11,7 +11,6 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 SMALL = {"dim": 32, "heads": 4, "feedforward": 48, "layers": 2, "steps": 6, "state": 5, "action": 4, "latent": 3}
-SMALL["width"] = 4
 MEAN, STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 

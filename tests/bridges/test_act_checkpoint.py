@@ -106,7 +106,7 @@ def test_the_network_of_the_paper_is_imported_whole():
 def trained(**options):
     torch.manual_seed(0)
     sizes = {"dim": 32, "feedforward": 48, "heads": 4, "encoder_layers": 2, "cvae_layers": 2, "latent_dim": 3}
-    more = {"chunk_length": 6, "state_dim": 5, "action_dim": 4, "backbone_width": 4, "cameras": TWO}
+    more = {"chunk_length": 6, "state_dim": 5, "action_dim": 4, "cameras": TWO}
     policy = ACT(**{**sizes, **more, "precision": "fp32", "backbone_norm": "batch", **options})
     for name, value in policy.named_buffers():
         if name.endswith(("running_var", "running_mean", "_scale", "_shift")) and value.dim() == 1:
@@ -119,7 +119,7 @@ def test_a_policy_of_ours_drives_the_original_code(images, state):
     policy = trained(decoder_readout="first")
     back = export_act(policy)
     assert any("copies of the first" in note for note in back.notes)
-    code = OriginalACT(dim=32, heads=4, feedforward=48, layers=2, steps=6, state=5, action=4, latent=3, width=4)
+    code = OriginalACT(dim=32, heads=4, feedforward=48, layers=2, steps=6, state=5, action=4, latent=3)
     code.load_state_dict({name.removeprefix("model."): value for name, value in back.weights.items()})
     theirs = executed(code.eval(), back.statistics, images, state)
     torch.testing.assert_close(policy.predict(Observation(images, state)).actions, theirs, atol=1e-5, rtol=0)
@@ -133,6 +133,7 @@ def test_a_policy_of_ours_drives_the_original_code(images, state):
         ({"keypoints": 2}, "keypoints"),
         ({"camera_embedding": True}, "camera_embedding"),
         ({"backbone_stem": "unshuffle"}, "backbone_stem"),
+        ({"backbone_width": 8}, "backbone_width"),
         ({"backbone_norm": "group"}, "backbone_norm"),
         ({"cvae_layers": 0}, "one setting for both"),
     ],

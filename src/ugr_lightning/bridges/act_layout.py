@@ -252,6 +252,7 @@ def check_plain(policy: ACT, project: str, drop_refinement: bool) -> None:
         raise ConfigError(f"--to {project}", "plain ACT", "a policy with refinement or an uncertainty head", fix)
     published = {
         "backbone_stem": "standard",
+        "backbone_width": 64,
         "backbone_stride": 32,
         "camera_embedding": False,
         "position_in_values": False,
@@ -264,6 +265,9 @@ def check_plain(policy: ACT, project: str, drop_refinement: bool) -> None:
     if given["backbone_norm"] == "group":
         fix = "Only normalisation with fixed statistics can be exported; `--to safetensors` takes any."
         raise ConfigError(f"--to {project}: backbone_norm", "frozen or batch", "group", fix)
+    if policy.causal and len(policy.decoder) > 1:
+        fix = "Only a first layer is the same with and without the mask; use `--to safetensors`."
+        raise ConfigError(f"--to {project}: causal", False, True, fix)
     if given["state_dropout"] >= 1:
         fix = "The published network always sees the state; use `--to safetensors`."
         raise ConfigError(f"--to {project}: state_dropout", "below 1", given["state_dropout"], fix)
