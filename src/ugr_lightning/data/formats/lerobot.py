@@ -1,0 +1,295 @@
+"""LeRobotDataset v3.0: joints in Parquet tables, pictures in videos or in the tables, several episodes per file.
+
+`meta/info.json` says what there is, `meta/episodes/*/*.parquet` in which file and at which time each episode is. An
+action is the command of its own row. Needs the extra `lerobot` (pyarrow, av).
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ugr_lightning.data.episode import Episode
+from ugr_lightning.data.formats import Contents, EpisodeFormat, EpisodeLocation
+from ugr_lightning.data.frames import FrameSource
+from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout, policy_cameras
+from ugr_lightning.data.lerobot_files import ACTION, CAMERA, INFO, STATE, write_dataset
+from ugr_lightning.data.tables import TablePictures, column_values, float_rows, read_table
+from ugr_lightning.data.video import VideoFrames, View, check_video
+from ugr_lightning.errors import DataError
+
+FIX = "Copy the dataset again."
+UPGRADE = (
+    "Convert it with lerobot: `python -m lerobot.datasets.v30.convert_dataset_v21_to_v30 --repo-id=NAME` "
+    "(from lerobot 0.5: `python -m lerobot.scripts.convert_dataset_v21_to_v30`)."
+)
+MAX_JSON_BYTES = 2**24
+MAX_HZ = 10_000
+
+
+class LeRobot(EpisodeFormat):
+    """Datasets of lerobot from 0.4 on, read and written.
+
+    Cameras are called what follows `observation.images.`. Read with pictures in the tables, the encoded pictures of
+    every episode that is in use are in memory; with videos, nothing is.
+    """
+
+    name = "lerobot"
+    marks = "`meta/info.json` with `codebase_version` and `features`"
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether its description is one of lerobot's, of any version."""
+        try:
+            return {"codebase_version", "features"} <= set(_read_json(Path(folder) / INFO))
+        except DataError:
+            return False
+
+    def find(self, folder: Path) -> dict[int, EpisodeLocation]:
+        """The row of each episode in the tables of `meta/episodes`."""
+        folder = Path(folder)
+        total = _Info.read(folder).total_episodes
+        found: dict[int, EpisodeLocation] = {}
+        for path in sorted((folder / "meta/episodes").glob("*/*.parquet")):
+            indices = column_values(read_table(path, ["episode_index"]), "episode_index", path)
+            for row, index in enumerate(map(int, indices)):
+                if index in found:
+                    got = f"another in {found[index].path.name}"
+                    raise DataError(path, f"one row for episode {index}", got, FIX)
+                found[index] = EpisodeLocation(path, f"episode {index}", (row, row + 1))
+        if total is not None and len(found) != total:
+            raise DataError(folder / INFO, f"{len(found)} episodes, as in meta/episodes", total, FIX)
+        return dict(sorted(found.items()))
+
+    def peek(self, location: EpisodeLocation) -> Contents:
+        """The cameras by the last part of their names, and the joints by theirs."""
+        info = _Info.read(_root(location.path))
+        state, action = (info.columns(key) or tuple(map(str, range(info.width(key)))) for key in (STATE, ACTION))
+        return Contents(policy_cameras(info.cameras, _names(info.cameras)), state, action)
+
+    def read(self, location: EpisodeLocation, cameras: Sequence[str], layout: Layout = DEFAULT_LAYOUT) -> Episode:
+        """Check one episode; row t of it is step t, labelled `action[t]`."""
+        info = _Info.read(_root(location.path))
+        keys = layout.find_cameras(cameras, info.cameras, _names(info.cameras), info.root)
+        about = info.episode(location, keys)
+        path, index = info.data_file(about), int(about["episode_index"])
+        rows = _find_rows(path, index, int(about["length"]))
+        table = read_table(path, ["frame_index", "timestamp", STATE, ACTION], rows)
+        times = _check_times(table, path, info.fps, rows[1] - rows[0])
+        state, action = (float_rows(table, key, path) for key in (STATE, ACTION))
+        state = layout.take(state, "state", info.columns(STATE), f"{path}:{STATE}")
+        action = layout.take(action, "action", info.columns(ACTION), f"{path}:{ACTION}")
+        extras = {"control_hz": info.fps, **({"instruction": about["tasks"][0]} if about.get("tasks") else {})}
+        return Episode(
+            path=path,
+            cameras=tuple(cameras),
+            state=state,
+            action=action,
+            frames=_find_frames(info, about, keys, path, rows, times),
+            seed=location.seed,
+            extras=extras,
+            label=f"episode{index}",
+        )
+
+    def write(
+        self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None
+    ) -> None:
+        """Write a dataset, see `lerobot_files.write_dataset`."""
+        write_dataset(Path(folder), episodes, done)
+
+
+@dataclass(frozen=True)
+class _Info:
+    """What `meta/info.json` says, checked.
+
+    Args:
+        root: folder of the dataset.
+        fps: frames per second.
+        features: what every row has, by name.
+        data_path, video_path: patterns of file names under the root.
+        total_episodes: how many there are; None where it does not say.
+    """
+
+    root: Path
+    fps: float
+    features: Mapping[str, Mapping[str, Any]]
+    data_path: str
+    video_path: str | None
+    total_episodes: int | None
+
+    @classmethod
+    def read(cls, root: Path) -> "_Info":
+        """Read and check it.
+
+        Raises:
+            DataError: damaged, of another version, or without joints and commands.
+        """
+        where = root / INFO
+        content = _read_json(where)
+        version = str(content.get("codebase_version"))[:40]
+        if version.startswith(("v1.", "v2.")):
+            raise DataError(f"{where}:codebase_version", "v3.0", version, UPGRADE)
+        if not version.startswith("v3."):
+            raise DataError(f"{where}:codebase_version", "v3.0", version, "Update ugr-lightning.")
+        features, fps, total = content.get("features"), content.get("fps"), content.get("total_episodes")
+        if not isinstance(features, dict) or not all(map(_is_feature, features.values())):
+            raise DataError(f"{where}:features", "names with `dtype` and `shape`", str(features)[:80], FIX)
+        if isinstance(fps, bool) or not isinstance(fps, (int, float)) or not 0 < fps <= MAX_HZ:
+            raise DataError(f"{where}:fps", "frames per second", str(fps)[:40], FIX)
+        for key in (STATE, ACTION):
+            if key not in features or len(features[key]["shape"]) != 1:
+                expected = f"a vector `{key}`"
+                raise DataError(f"{where}:features", expected, ", ".join(features)[:120] or "nothing", FIX)
+        data, video = content.get("data_path"), content.get("video_path")
+        if not isinstance(data, str) or not isinstance(video, (str, type(None))):
+            raise DataError(where, "`data_path` and `video_path`", f"{data!r}, {video!r}"[:120], FIX)
+        return cls(root, float(fps), features, data, video, total if isinstance(total, int) else None)
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """The features that are colour pictures."""
+        return tuple(
+            key
+            for key, feature in self.features.items()
+            if feature["dtype"] in ("video", "image") and not _is_depth(feature)
+        )
+
+    def width(self, key: str) -> int:
+        """Length of a vector."""
+        return int(self.features[key]["shape"][0])
+
+    def columns(self, key: str) -> tuple[str, ...]:
+        """The names of a vector's numbers; empty where they are not given one by one."""
+        names = self.features[key].get("names")
+        if isinstance(names, dict):  # {"motors": [...]}
+            names = [name for group in names.values() if isinstance(group, list) for name in group]
+        if isinstance(names, list) and len(names) == self.width(key) and len(set(map(str, names))) == len(names):
+            return tuple(map(str, names))
+        return ()
+
+    def episode(self, location: EpisodeLocation, keys: Sequence[str]) -> dict[str, Any]:
+        """The row of `meta/episodes` that describes an episode, with the places of these cameras."""
+        names = ["episode_index", "length", "data/chunk_index", "data/file_index", "tasks"]
+        for key in keys:
+            if self.features[key]["dtype"] == "video":
+                names += [f"videos/{key}/{part}" for part in ("chunk_index", "file_index", "from_timestamp")]
+        row = read_table(location.path, names, location.rows).to_pylist()[0]
+        wrong = [name for name in names if name != "tasks" and not _is_place(row[name])]
+        if wrong or row["length"] < 1:
+            got = f"{wrong or ['length']}: {row[(wrong or ['length'])[0]]!r}"[:120]
+            raise DataError(f"{location.path}:{location.key}", "numbers that say where the episode is", got, FIX)
+        return row
+
+    def data_file(self, about: Mapping[str, Any]) -> Path:
+        """The table an episode is in."""
+        return self._file(self.data_path, about["data/chunk_index"], about["data/file_index"])
+
+    def video_file(self, about: Mapping[str, Any], key: str) -> Path:
+        """The video an episode's pictures of a camera are in."""
+        if self.video_path is None:
+            raise DataError(f"{self.root / INFO}:video_path", "a pattern, as there are videos", None, FIX)
+        chunk, number = (about[f"videos/{key}/{part}"] for part in ("chunk_index", "file_index"))
+        return self._file(self.video_path, chunk, number, key)
+
+    def _file(self, pattern: str, chunk: float, number: float, key: str = "") -> Path:
+        try:
+            name = pattern.format(video_key=key, chunk_index=int(chunk), file_index=int(number))
+        except (KeyError, IndexError, ValueError, AttributeError, MemoryError) as error:
+            raise DataError(self.root / INFO, "patterns of file names", f"{pattern!r}"[:120], FIX) from error
+        path = self.root / name
+        if "\0" in name or len(name) > 1000 or not path.resolve().is_relative_to(self.root.resolve()):
+            raise DataError(self.root / INFO, "files inside the dataset", f"{name!r}"[:120], FIX)
+        return path
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    try:
+        if path.stat().st_size > MAX_JSON_BYTES:
+            raise ValueError(f"{path.stat().st_size} bytes")
+        content = json.loads(path.read_text())
+        if not isinstance(content, dict):
+            raise ValueError(type(content).__name__)
+    except (OSError, ValueError, RecursionError) as error:
+        raise DataError(path, "a JSON object", str(error)[:120], FIX) from error
+    return content
+
+
+def _is_feature(feature: object) -> bool:
+    if not isinstance(feature, dict) or not isinstance(feature.get("dtype"), str):
+        return False
+    shape = feature.get("shape")
+    return isinstance(shape, list) and all(type(size) is int and size > 0 for size in shape)
+
+
+def _is_depth(feature: Mapping[str, Any]) -> bool:
+    places = [feature.get("info"), feature.get("video_info")]
+    return any(
+        bool(place.get(name))
+        for place in places
+        if isinstance(place, dict)
+        for name in ("is_depth_map", "video.is_depth_map")
+    )
+
+
+def _is_place(value: object) -> bool:
+    return isinstance(value, (int, float)) and bool(np.isfinite(value)) and 0 <= value < 2**31
+
+
+def _names(cameras: Sequence[str]) -> dict[str, str]:
+    """The policy's names of cameras: what follows `observation.images.`, or the last part of the name."""
+    return {key.removeprefix(CAMERA) if key.startswith(CAMERA) else key.rsplit(".", 1)[-1]: key for key in cameras}
+
+
+def _root(path: Path) -> Path:
+    """The folder of the dataset that a file of `meta/episodes` belongs to."""
+    return path.parents[3]
+
+
+def _find_rows(path: Path, index: int, length: int) -> tuple[int, int]:
+    """First and past-the-last row of an episode in its table."""
+    indices = column_values(read_table(path, ["episode_index"]), "episode_index", path)
+    rows = np.flatnonzero(indices == index)
+    if len(rows) != length or rows[-1] - rows[0] != length - 1:
+        got = f"{len(rows)} rows" + ("" if len(rows) != length else " with others between them")
+        raise DataError(f"{path}:episode_index", f"{length} rows of episode {index}", got, FIX)
+    return int(rows[0]), int(rows[-1]) + 1
+
+
+def _check_times(table: Any, path: Path, fps: float, length: int) -> np.ndarray:
+    """The time of each row, (T,) float64 in s; rows have to be in order, a frame apart."""
+    numbers = column_values(table, "frame_index", path)
+    if not np.array_equal(numbers, np.arange(length)):
+        raise DataError(f"{path}:frame_index", f"0 to {length - 1}", numbers[:5].tolist(), FIX)
+    times = column_values(table, "timestamp", path).astype(np.float64)
+    off = np.abs(times - np.arange(length) / fps)
+    if times.shape != (length,) or not (off < 0.25 / fps).all():
+        got = f"{times[int(np.argmax(off))] if times.shape == (length,) else times.shape}"
+        raise DataError(f"{path}:timestamp", f"rows that are 1/{fps:g} s apart", got, FIX)
+    return times
+
+
+def _find_frames(
+    info: _Info, about: Mapping[str, Any], keys: Sequence[str], path: Path, rows: tuple[int, int], times: np.ndarray
+) -> FrameSource:
+    """Videos or pictures in the table, checked; one kind for all cameras."""
+    kinds = {info.features[key]["dtype"] for key in keys}
+    if len(kinds) > 1:
+        raise DataError(info.root / INFO, "cameras of one kind", "videos and images", "Choose cameras of one kind.")
+    if kinds == {"image"}:
+        return TablePictures(path, keys, rows)
+    views, sizes = [], []
+    for key in keys:
+        view = View(info.video_file(about, key), key, float(about[f"videos/{key}/from_timestamp"]))
+        size, end = check_video(view.path)
+        shape = info.features[key]["shape"]
+        if len(shape) != 3 or size not in ((shape[0], shape[1]), (shape[1], shape[2])):
+            raise DataError(view.path, f"pictures of {shape}, as info.json says", size, FIX)
+        if view.start + times[-1] > end - 0.25 / info.fps:
+            raise DataError(view.path, f"a video longer than {view.start + times[-1]:.3f} s", f"{end:.3f} s", FIX)
+        views.append(view)
+        sizes.append(size)
+    if len(set(sizes)) > 1:
+        raise DataError(info.root / INFO, "cameras of one size", sizes, "Choose cameras of one size.")
+    return VideoFrames(views, times, info.fps, sizes[0])
