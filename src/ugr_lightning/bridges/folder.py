@@ -1,7 +1,9 @@
 """Folders that other projects import: written from the package's templates, and never over somebody else's files."""
 
+import json
 import os
 import re
+import shutil
 from collections.abc import Mapping
 from importlib.resources import files
 from pathlib import Path
@@ -43,3 +45,37 @@ def write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Pa
     except OSError as error:
         raise ConfigError(out, "a folder that can be written", error, "Choose another folder.") from error
     return list(contents)
+
+
+def place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping[str, str], copy: bool) -> list[Path]:
+    """Write a folder that knows where its checkpoint is: `@CHECKPOINT@` in the template.
+
+    Args:
+        template: see `write_folder`.
+        checkpoint: the file.
+        out: see `write_folder`.
+        values: see `write_folder`.
+        copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
+
+    Returns:
+        The files written.
+    """
+    place = out / "policy_best.ckpt" if copy else checkpoint.resolve()
+    named = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
+    written = write_folder(template, out, {**values, "CHECKPOINT": named})
+    if not copy:
+        return written
+    shutil.copyfile(checkpoint, place.with_name(place.name + ".partial"))
+    os.replace(place.with_name(place.name + ".partial"), place)
+    return [*written, place]
+
+
+def require_module_name(out: Path) -> None:
+    """Refuse a folder that could not be imported by its name.
+
+    Raises:
+        ConfigError: its name is none of a Python module.
+    """
+    if not out.name.isidentifier():
+        fix = "It is imported by its name; use e.g. policy/UGR."
+        raise ConfigError("--out", "a folder named like a Python module", out.name, fix)

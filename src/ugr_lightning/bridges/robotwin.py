@@ -1,7 +1,6 @@
 """RoboTwin 2.0's policy interface: what the folder written by `ugr bridge robotwin` calls (FACTS 7.1)."""
 
 import json
-import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -9,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.bridges.deployment import Deployment
-from ugr_lightning.bridges.folder import write_folder
+from ugr_lightning.bridges.folder import place_checkpoint, require_module_name
 from ugr_lightning.bridges.settings import choose_execution, number, shape, switch, text
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
 
@@ -146,22 +145,11 @@ def write_policy(
         ConfigError: the folder holds something else, or its name cannot be imported.
         CheckpointError: the checkpoint cannot be evaluated.
     """
-    if not out.name.isidentifier():
-        fix = "RoboTwin imports the folder by its name; use e.g. policy/UGR."
-        raise ConfigError("--out", "a folder named like a Python module", out.name, fix)
-    place = "policy_best.ckpt" if copy else str(checkpoint.resolve())
+    require_module_name(out)
     model = get_model({"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": cameras})
-    named = "".join(
-        f"\n  {json.dumps(camera)}: {json.dumps(name)}" for camera, name in model.deployment.cameras.items()
-    )
-    values = {"POLICY": out.name, "CHECKPOINT": json.dumps(place), "EXECUTION": str(execution), "CAMERAS": named}
-    written = write_folder("robotwin", out, values)
-    if copy:
-        target = out / place
-        shutil.copyfile(checkpoint, target.with_name(target.name + ".partial"))
-        target.with_name(target.name + ".partial").replace(target)
-        written.append(target)
-    return written
+    named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in model.deployment.cameras.items())
+    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
+    return place_checkpoint("robotwin", checkpoint, out, values, copy)
 
 
 def _cameras(given: Any) -> dict[str, str]:

@@ -32,7 +32,79 @@ def _robotwin(
     return 0
 
 
-FUNCTIONS: dict[str, Callable[..., int]] = {"robotwin": _robotwin}
+def _xpolicylab(
+    ckpt: str,
+    out: str = "policy/UGR",
+    execution: ExecutionName = "aggregate",
+    cameras: dict[str, str] | None = None,
+    copy: bool = False,
+) -> int:
+    """Write an adapter folder for XPolicyLab's evaluation.
+
+    Args:
+        ckpt: checkpoint file from `ugr fit`.
+        out: the folder; its name is the policy's. `policy/NAME` of an XPolicyLab checkout.
+        execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
+        cameras: XPolicyLab's names of the policy's cameras, where they are not the usual ones.
+        copy: put the checkpoint into the folder; otherwise the folder points to where it is.
+    """
+    from ugr_lightning.bridges.xpolicylab.adapter import write_adapter
+
+    written = write_adapter(Path(ckpt), Path(out), execution=execution, cameras=cameras, copy=copy)
+    print("\n".join(f"  {path}" for path in written))
+    print(f"In XPolicyLab: bash policy/{Path(out).name}/eval.sh; its README has the arguments.")
+    return 0
+
+
+def _serve(
+    ckpt: str | None = None,
+    folder: str | None = None,
+    host: str = "127.0.0.1",
+    port: int = 19000,
+    execution: ExecutionName | None = None,
+    bench_name: str | None = None,
+    task_name: str | None = None,
+    ckpt_name: str | None = None,
+    env_cfg_type: str | None = None,
+    action_type: str | None = None,
+    seed: str | None = None,
+) -> int:
+    """Answer XPolicyLab's environment clients over a websocket, until interrupted.
+
+    Args:
+        ckpt: checkpoint file from `ugr fit`; null takes what the folder says.
+        folder: adapter folder written by `ugr bridge xpolicylab`; null serves the checkpoint with the usual settings.
+        host: where to listen; the default is reachable from this machine only.
+        port: where to listen; 0 takes a free one.
+        execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
+        bench_name: XPolicyLab's name of the benchmark.
+        task_name: XPolicyLab's name of the task.
+        ckpt_name: which run, where the folder names no checkpoint.
+        env_cfg_type: XPolicyLab's name of the robot.
+        action_type: `joint`.
+        seed: of the training.
+    """
+    import asyncio
+
+    from ugr_lightning.bridges.xpolicylab.adapter import read_deployment
+    from ugr_lightning.bridges.xpolicylab.model import Model
+    from ugr_lightning.bridges.xpolicylab.server import PolicyServer
+
+    names = {"bench_name": bench_name, "task_name": task_name, "ckpt_name": ckpt_name, "env_cfg_type": env_cfg_type}
+    given = {**names, "action_type": action_type, "seed": seed, "execution": execution}
+    given["checkpoint"] = None if ckpt is None else str(Path(ckpt).resolve())
+    if folder is None and ckpt is None:
+        fix = "Give --ckpt FILE, or --folder of `ugr bridge xpolicylab`."
+        raise ConfigError("ugr bridge serve", "a checkpoint", "none", fix)
+    config = given if folder is None else read_deployment(Path(folder), given)
+    model = Model(config, None if folder is None else Path(folder).resolve())
+    print(f"policy: {model.deployment}", flush=True)
+    server = PolicyServer(model, host, port)
+    asyncio.run(server.serve(lambda url: print(f"listening on {url}", flush=True)))
+    return 0
+
+
+FUNCTIONS: dict[str, Callable[..., int]] = {"robotwin": _robotwin, "xpolicylab": _xpolicylab, "serve": _serve}
 
 
 def run(command: str, argv: Sequence[str]) -> int:

@@ -1,0 +1,277 @@
+"""XPolicyLab's `Model`: a checkpoint of ours for one or several of its environments (FACTS 7.2)."""
+
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ugr_lightning.bridges.deployment import Deployment, Seen
+from ugr_lightning.bridges.settings import choose_execution, number, shape, switch, text
+from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
+
+CAMERAS = {"cam_high": "cam_head", "cam_right_wrist": "cam_right_wrist", "cam_left_wrist": "cam_left_wrist"}
+"""XPolicyLab's names of our cameras (FACTS 1.3)."""
+ENVIRONMENTS = 32
+FILES = ("policy_best.ckpt", "last.ckpt")
+Actions = list[dict[str, np.ndarray]]
+
+
+@dataclass
+class Environment:
+    """What is remembered of one environment.
+
+    Args:
+        slot: of the deployment.
+        joints: names and lengths of the parts of its joint vector.
+        waiting: an observation that no actions have been given for.
+        answered: the observation that the last actions were given for.
+        actions: these actions.
+        step: their number in the client's count, where it counts.
+        request: name of the request they answered, where it has one.
+    """
+
+    slot: int
+    joints: tuple[tuple[str, int], ...] = ()
+    waiting: Seen | None = None
+    answered: Seen | None = None
+    actions: Actions | None = None
+    step: int | None = None
+    request: str | None = None
+
+
+class Model:
+    """The policy of an XPolicyLab adapter; single and batched calls, environments told apart by `env_idx`.
+
+    Several clients may share it through `infer`, each under a session of its own. A call that is made twice for one
+    observation gives the same actions and moves nothing on. Actions are given up to the step at which the policy
+    wants to see again, so that it misses no observation when only the newest one travels with a request.
+
+    Args:
+        model_cfg: of `deploy.yml`: `checkpoint` or `ckpt_name`, `execution`, and optionally `temporal_agg`, `cameras`,
+            `image_size`, `device`, `refine_ratio`, `environments` (how many are remembered).
+        folder: the adapter's folder, which relative checkpoints are in.
+
+    Raises:
+        ConfigError: a value that cannot work.
+        CheckpointError: no usable checkpoint.
+    """
+
+    def __init__(self, model_cfg: Mapping[str, Any], folder: Path | None = None) -> None:
+        if text(model_cfg, "action_type", "joint") != "joint":
+            fix = "Evaluate with action_type joint: the policy commands joint targets."
+            raise ConfigError("action_type", "joint", model_cfg["action_type"], fix)
+        self._count = count = int(number(model_cfg, "environments") or ENVIRONMENTS)
+        self.deployment = Deployment(
+            find_checkpoint(model_cfg, folder or Path()),
+            cameras=CAMERAS | dict(model_cfg.get("cameras") or {}),
+            execution=choose_execution(model_cfg.get("execution"), switch(model_cfg, "temporal_agg")),
+            slots=count,
+            image_size=shape(model_cfg, "image_size"),
+            device=text(model_cfg, "device", "auto"),
+            refine_ratio=number(model_cfg, "refine_ratio"),
+        )
+        self._free = list(reversed(range(count)))
+        self._environments: dict[tuple[Hashable, int], Environment] = {}  # least recently used first
+        self._latest: list[int] = []
+
+    def update_obs(self, obs: Mapping[str, Any]) -> None:
+        """The newest observation of one environment."""
+        self.update_obs_batch([obs])
+
+    def update_obs_batch(self, obs_list: Sequence[Mapping[str, Any]]) -> None:
+        """The newest observations of some environments; earlier ones that nobody asked about are dropped."""
+        if len(obs_list) > self._count:
+            fix = "Raise `environments` in deploy.yml."
+            raise ConfigError("environments", f"at most {self._count} at once", len(obs_list), fix)
+        seen = [(environment_index(obs), self._see(obs)) for obs in obs_list]
+        for index, (observation, joints) in seen:
+            environment = self._environment(("", index))
+            environment.waiting, environment.joints = observation, joints
+        self._latest = [index for index, _ in seen]
+
+    def get_action(self) -> Actions:
+        """Actions for the environment that was observed last; the same again where nothing new was observed."""
+        return self.get_action_batch(self._latest[:1])[0]
+
+    def get_action_batch(self, env_idx_list: Iterable[int] | None = None) -> list[Actions]:
+        """Actions for some environments, the same number for each.
+
+        Args:
+            env_idx_list: which; None means those observed last.
+
+        Raises:
+            ProtocolError: one of them has not been observed.
+        """
+        indices = self._latest if env_idx_list is None else [int(index) for index in env_idx_list]
+        known = [self._environments.get(("", index)) for index in indices]
+        environments = [one for one in known if one is not None and (one.waiting or one.actions)]
+        if not indices or len(environments) < len(indices):
+            fix = "Call update_obs or update_obs_batch first."
+            raise ProtocolError("get_action", "an observation of each environment", f"none of some of {indices}", fix)
+        self._plan([one for one in environments if one.waiting is not None])
+        return [one.actions or [] for one in environments]
+
+    def infer(
+        self,
+        observation: Mapping[str, Any],
+        *,
+        session: Hashable = "",
+        step: int | None = None,
+        request: str | None = None,
+    ) -> Actions:
+        """Actions for one observation.
+
+        A request is taken for one that was sent again where it bears the name of the last one of its environment, or
+        the same step and the same observation; it gets the same actions.
+
+        Args:
+            observation: in XPolicyLab's form.
+            session: which client asks.
+            step: how many inferences the client has received since its reset; None where it does not count.
+            request: name of the request, the same when it is sent again.
+
+        Raises:
+            ProtocolError: the observation has another form, or belongs to an episode whose beginning is unknown.
+        """
+        seen, joints = self._see(observation)
+        key = (session, environment_index(observation))
+        if key not in self._environments and step:
+            fix = "Reset and begin the episode anew; the server was restarted, or has forgotten it for newer ones."
+            raise ProtocolError(f"environment {key[1]}", "an episode from its first step on", f"step {step}", fix)
+        environment = self._environment(key)
+        again = request is not None and request == environment.request
+        if step is not None and step == environment.step and environment.answered is not None:
+            again |= _same(seen, environment.answered)
+        if again and environment.actions is not None:
+            return environment.actions
+        if step is not None and environment.step is not None and step < environment.step:
+            fix = "Reset at the beginning of an episode."
+            raise ProtocolError(f"environment {key[1]}", f"step {environment.step} or later", f"step {step}", fix)
+        environment.waiting, environment.joints = seen, joints
+        self._plan([environment])
+        environment.step, environment.request = step, request
+        assert environment.actions is not None
+        return environment.actions
+
+    def reset(self, case: Any = None, *, session: Hashable = "") -> None:
+        """Episodes begin: forget all environments of a client; `case` is what some callers pass, and has no effect."""
+        for key in [key for key in self._environments if key[0] == session]:
+            self._free.append(self._environments.pop(key).slot)
+        if session == "":
+            self._latest = []
+
+    def prepare_case(self, case_meta: Any = None) -> None:
+        """Nothing to prepare."""
+
+    def on_trial_end(self, result: Any = None) -> None:
+        """Nothing to tidy up: the reset of the next trial does."""
+
+    def _see(self, observation: Mapping[str, Any]) -> tuple[Seen, tuple[tuple[str, int], ...]]:
+        pictures, state, joints = read_observation(observation)
+        return self.deployment.see(pictures, state), joints
+
+    def _environment(self, key: tuple[Hashable, int]) -> Environment:
+        """The memory of an environment; a new one takes the place of the least recently used where all are taken."""
+        environment = self._environments.pop(key, None)
+        if environment is None:
+            if not self._free:
+                self._free.append(self._environments.pop(next(iter(self._environments))).slot)
+            environment = Environment(self._free.pop())
+            self.deployment.begin(environment.slot)
+        self._environments[key] = environment  # to the end: most recently used
+        return environment
+
+    def _plan(self, environments: Sequence[Environment]) -> None:
+        """Give actions to environments with new observations."""
+        if not environments:
+            return
+        seen = {one.slot: one.waiting for one in environments if one.waiting is not None}
+        plans = self.deployment.act(seen)
+        for one in environments:
+            one.actions = [name_joints(action, one.joints) for action in plans[one.slot]]
+            one.answered, one.waiting = one.waiting, None
+
+
+def environment_index(observation: Mapping[str, Any]) -> int:
+    """Which environment an observation is of; 0 where it does not say.
+
+    Raises:
+        ProtocolError: not a number from 0.
+    """
+    index = observation.get("env_idx") if isinstance(observation, Mapping) else None
+    if index is None:
+        return 0
+    if isinstance(index, (int, np.integer)) and not isinstance(index, bool) and index >= 0:
+        return int(index)
+    raise ProtocolError("observation/env_idx", "a number from 0", str(index)[:40], "Number the environments.")
+
+
+def read_observation(
+    observation: Mapping[str, Any],
+) -> tuple[dict[str, Any], np.ndarray, tuple[tuple[str, int], ...]]:
+    """Pictures by camera, joints, and what the parts of the joint vector are called.
+
+    Args:
+        observation: `vision/<camera>/color` and `state/[left_|right_]{arm,ee}_joint_state`.
+
+    Returns:
+        Pictures, (S,) joints in the order [left arm, left gripper, right arm, right gripper], (name, length) of parts.
+
+    Raises:
+        ProtocolError: it has another form.
+    """
+    fix = "Send XPolicyLab's observation v1.0 with action_type joint."
+    try:
+        pictures = {name: view["color"] for name, view in observation["vision"].items() if "color" in view}
+        state = observation["state"]
+        sides = ("left_", "right_") if "left_arm_joint_state" in state else ("",)
+        arm = "joint_state" if sides == ("",) and "arm_joint_state" not in state else "arm_joint_state"
+        names = [f"{side}{part}" for side in sides for part in (arm, "ee_joint_state")]
+        parts = [np.asarray(state[name], np.float64) for name in names]
+    except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+        expected = "vision/<camera>/color and state/..._joint_state"
+        raise ProtocolError("observation", expected, f"{type(error).__name__} {error}"[:80], fix) from error
+    if any(part.ndim != 1 for part in parts):
+        raise ProtocolError("observation/state", "vectors", [part.shape for part in parts], fix)
+    return pictures, np.concatenate(parts), tuple((name, len(part)) for name, part in zip(names, parts, strict=True))
+
+
+def name_joints(action: np.ndarray, joints: Sequence[tuple[str, int]]) -> dict[str, np.ndarray]:
+    """An action (A,) as the named parts of the robot."""
+    ends = np.cumsum([length for _, length in joints])
+    if ends[-1] != len(action):
+        fix = "Evaluate on the robot of the training."
+        raise ProtocolError("robot", f"{len(action)} joints, as the policy commands", f"{ends[-1]}", fix)
+    parts = np.split(action, ends[:-1])
+    return {name: part.copy() for (name, _), part in zip(joints, parts, strict=True)}
+
+
+def find_checkpoint(config: Mapping[str, Any], folder: Path) -> Path:
+    """The checkpoint that a `deploy.yml` means.
+
+    Args:
+        config: `checkpoint`, a file; or `ckpt_name`: a file, or a folder with one, by itself or under `checkpoints/`,
+            also in XPolicyLab's spelling `<bench>-<ckpt>-<env_cfg>-<action_type>-<seed>`.
+        folder: the adapter's folder.
+
+    Raises:
+        CheckpointError: nothing there.
+    """
+    if config.get("checkpoint"):
+        return folder / text(config, "checkpoint")
+    name = text(config, "ckpt_name")
+    setting = [config.get(key) for key in ("bench_name", "ckpt_name", "env_cfg_type", "action_type", "seed")]
+    runs = folder / "checkpoints"
+    places = [folder / name, runs / "-".join(map(str, setting)), runs / name]
+    files = [file for place in places for file in (place, *(place / file for file in FILES))]
+    found = next((file for file in files if file.is_file()), None)
+    if found is None:
+        fix = "Set `checkpoint` in deploy.yml to a file from `ugr fit`."
+        raise CheckpointError("ckpt_name", f"{' or '.join(FILES)} in one of {', '.join(map(str, places))}", "none", fix)
+    return found
+
+
+def _same(one: Seen, other: Seen) -> bool:
+    return np.array_equal(one.commanded, other.commanded) and np.array_equal(one.images, other.images)

@@ -1,0 +1,492 @@
+"""The adapter for XPolicyLab: its model, and its server over real sockets."""
+
+import importlib
+import os
+import pickle
+import resource
+import subprocess
+import sys
+import threading
+import types
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from deployed import Recaller, save, tiny_act
+from fake_policy import Reacher
+from fake_simulator import HOME, FakeSimulator
+
+from ugr_lightning.bridges.deployment import Deployment
+from ugr_lightning.bridges.xpolicylab import codec
+from ugr_lightning.bridges.xpolicylab.adapter import read_deployment, write_adapter
+from ugr_lightning.bridges.xpolicylab.frames import read_frame
+from ugr_lightning.bridges.xpolicylab.model import CAMERAS, Model, find_checkpoint
+from ugr_lightning.contract import Statistics
+from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
+from ugr_lightning.rollout.runner import run_episodes
+
+pytest.importorskip("msgpack", reason="the extra `xpolicylab` is not installed")
+pytest.importorskip("websockets", reason="the extra `xpolicylab` is not installed")
+
+import msgpack
+from websockets.exceptions import ConnectionClosed, InvalidStatus
+from websockets.sync.client import connect
+from xpolicylab_client import (
+    Client,
+    Direct,
+    Environments,
+    array_to_map,
+    decode,
+    encode,
+    joints_of,
+    observation,
+    request,
+)
+
+from ugr_lightning.bridges.xpolicylab.server import PolicyServer
+
+SIZE = (6, 8)
+
+
+@pytest.fixture(scope="module")
+def reacher(tmp_path_factory):
+    return save(Reacher(), tmp_path_factory.mktemp("run") / "policy_best.ckpt", image_size=SIZE)
+
+
+def serve(checkpoint, **config):
+    return PolicyServer(Model({"checkpoint": str(checkpoint), **config}), port=0)
+
+
+def seen(environment, step, size=SIZE):
+    """What an environment shows at a step: different for every one of both."""
+    rng = np.random.default_rng((environment, step))
+    picture = np.full((*size, 3), 40 + rng.integers(0, 30), np.uint8)
+    return observation(picture, HOME + rng.uniform(-0.1, 0.1, 14), environment)
+
+
+def alone(checkpoint, environment, steps, execution="aggregate"):
+    """The actions that an environment gets when it has the policy for itself."""
+    policy = Deployment(checkpoint, cameras=CAMERAS, execution=execution)
+    plans = []
+    for step in range(steps):
+        one = seen(environment, step)
+        joints = np.concatenate([one["state"][part] for part in one["state"] if part.endswith("joint_state")])
+        pictures = {name: view["color"] for name, view in one["vision"].items()}
+        plans.append(policy.act({0: policy.see(pictures, joints)})[0])
+    return plans
+
+
+def vectors(actions):
+    return np.stack([joints_of(action) for action in actions])
+
+
+def rolled_out(policy, seeds, execution):
+    results = run_episodes(
+        policy.for_inference(),
+        "reach",
+        seeds,
+        image_size=(30, 40),
+        execution=execution,
+        workers=1,
+        simulator=FakeSimulator,
+        progress=False,
+    )
+    return [(result.success, result.steps, result.motion_hash) for result in results]
+
+
+def fakes(seeds):
+    return Environments([FakeSimulator("reach", image_size=(30, 40)) for _ in seeds], seeds)
+
+
+@pytest.fixture
+def adapter(tmp_path, monkeypatch):
+    """Writes an adapter folder into a stand-in of XPolicyLab's package and imports a module of it."""
+    lab = tmp_path / "XPolicyLab"
+    for folder in (lab, lab / "policy"):
+        folder.mkdir(parents=True)
+        (folder / "__init__.py").touch()
+    (lab / "model_template.py").write_text("class ModelTemplate:\n    def reset(self): raise NotImplementedError\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [name for name in sys.modules if name.split(".")[0] == "XPolicyLab"]:
+        monkeypatch.delitem(sys.modules, name)
+
+    def write(checkpoint, **options):
+        write_adapter(checkpoint, lab / "policy" / "UGR", **options)
+        return lambda module: importlib.import_module(f"XPolicyLab.policy.UGR.{module}")
+
+    return write
+
+
+@pytest.mark.parametrize("execution", ["aggregate", 4])
+@pytest.mark.parametrize("policy", [Reacher(), Recaller(), tiny_act()], ids=["reacher", "recaller", "act"])
+def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, tmp_path, policy, execution):
+    seeds, folder = [0, 5, 6, 1], tmp_path / "XPolicyLab" / "policy" / "UGR"
+    module = adapter(save(policy, tmp_path / "a.ckpt"), execution=execution, copy=True)
+    expected = rolled_out(policy, seeds, execution)
+    model, deploy = module("model").Model(read_deployment(folder, {})), module("deploy")
+    batch = fakes(seeds)
+    deploy.eval_one_episode_batch(batch, Direct(model))
+    assert batch.outcomes() == expected, "all at once"
+    with PolicyServer(module("model").Model(read_deployment(folder, {})), port=0) as server:
+        client = Client(server.url)
+        for seed, outcome in zip(seeds, expected, strict=True):
+            single = fakes([seed])
+            deploy.eval_one_episode(single, client)
+            assert single.outcomes() == [outcome], "one after the other, over a socket"
+        batch = fakes(seeds)
+        deploy.eval_one_episode_batch(batch, client)
+        assert batch.outcomes() == expected, "all at once, over a socket"
+        client.close()
+
+
+def test_a_thousand_requests_of_eight_environments_with_reconnects_each_get_their_own_reply(reacher):
+    steps, environments = 125, 8
+    expected = {index: alone(reacher, index, steps) for index in range(environments)}
+
+    def drive(url, index):
+        rng, client = np.random.default_rng(index), Client(url, trial=f"worker {index % 4}")
+        replies, resent = [], 0
+        for step in range(steps):
+            client.step = step
+            one, name = seen(index, step), f"{index} {step}"
+            actions = client.infer(one, name=name)
+            if rng.random() < 0.1:  # the reply was lost on the way: connect anew and ask again
+                client.reconnect()
+                again = client.infer(one, **({"name": name} if rng.random() < 0.5 else {}))
+                assert np.array_equal(vectors(again), vectors(actions))
+                resent += 1
+            replies.append(vectors(actions))
+        client.close()
+        return replies, resent
+
+    with serve(reacher) as server, ThreadPoolExecutor(environments) as pool:
+        found = list(pool.map(lambda index: drive(server.url, index), range(environments)))
+    assert sum(resent for _, resent in found) > 50
+    for index, (replies, _) in enumerate(found):
+        assert all(np.array_equal(mine, own) for mine, own in zip(replies, expected[index], strict=True)), index
+
+
+class Code:
+    """Unpickling it would leave a folder behind."""
+
+    def __init__(self, folder):
+        self.folder = str(folder)
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+def malformed(rng, trap):
+    """Frames that are wrong in one way each."""
+    good = request("infer", {"observation": seen(0, 0)}, step=0)
+    whole, pickled = encode(good), pickle.dumps(Code(trap))
+
+    def infer(**changes):
+        return encode(request("infer", {"observation": seen(0, 0) | changes}))
+
+    def array(**changes):
+        wrong = {b"nd": True, b"type": "<f4", b"kind": b"", b"shape": [2], b"data": b"12345678"}
+        return encode({**good, "payload": {"observation": wrong | {k.encode(): v for k, v in changes.items()}}})
+
+    yield rng.bytes(int(rng.integers(0, 400)))
+    yield whole[: int(rng.integers(0, len(whole)))]
+    yield whole + rng.bytes(3)
+    flipped = bytearray(whole[:300])
+    flipped[int(rng.integers(0, 60))] ^= 1 << int(rng.integers(0, 8))
+    yield bytes(flipped)
+    yield "a text"
+    yield pickled
+    yield msgpack.packb([1, 2, 3])
+    yield msgpack.packb({1: 2})
+    yield b"\x91" * 2000
+    yield b"\xdd\xff\xff\xff\xff"
+    yield b"\xc6\xff\xff\xff\xff"
+    yield msgpack.packb(list(range(5000)))
+    yield msgpack.packb(msgpack.ExtType(42, pickled))
+    yield array(kind=b"O", type="|O", data=pickled)
+    yield array(type="|O", data=pickled)
+    yield array(shape=[10**12])
+    yield array(shape=[-1])
+    yield array(shape=[1] * 40)
+    yield array(shape="2")
+    yield array(type="f4,f4")
+    yield array(type="<f1")
+    yield array(type=[["a", "<f4"]])
+    yield array(data="12345678")
+    yield encode({**good, "surprise": 1})
+    yield encode({**good, "message_type": None})
+    yield encode({**good, "message_type": "x" * 300})
+    yield encode({**good, "message_type": "delete_everything"})
+    yield encode({**good, "message_type": "infer_result"})
+    yield encode({**good, "step": -1})
+    yield encode({**good, "step": True})
+    yield encode({**good, "payload": [1]})
+    yield encode({name: value for name, value in good.items() if name != "evaluation_id"})
+    yield encode(request("infer"))
+    yield encode(request("infer", {"observation": 7}))
+    yield infer(vision={})
+    yield infer(vision=3)
+    yield infer(vision={"cam_head": {"color": "red"}})
+    yield infer(state={})
+    yield infer(state={"left_arm_joint_state": "x"})
+    yield infer(state={f"{s}_{p}_joint_state": np.full(n, np.nan) for s in ("left", "right") for p, n in PARTS})
+    yield infer(env_idx=-1)
+    yield infer(env_idx="two")
+    yield infer(env_idx=[0])
+
+
+PARTS = (("arm", 6), ("ee", 1))
+
+
+def memory_mb():
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * resource.getpagesize() / 2**20
+
+
+def test_ten_thousand_malformed_frames_are_refused_politely_and_leave_nothing_behind(reacher, tmp_path, caplog):
+    rng, count, trap = np.random.default_rng(0), 0, tmp_path / "trap"
+    with serve(reacher) as server:
+        good = Client(server.url)
+        first = [vectors(good.infer(seen(0, step), name=f"good {step}")) for step in [0]]
+        with connect(server.url, compression=None) as connection:
+            warm = None
+            while count < 10_000:
+                frames = list(malformed(rng, trap))
+                for frame in frames:
+                    connection.send(frame)
+                for frame in frames:
+                    reply = decode(connection.recv(timeout=60))
+                    assert reply["message_type"] == "error", frame[:200]
+                    code, message = reply["payload"]["code"], reply["payload"]["message"]
+                    assert code in ("invalid_frame", "unknown_message_type", "infer_failed")
+                    assert "Traceback" not in message
+                    assert "File " not in message
+                    assert len(message) <= 1000
+                count += len(frames)
+                if warm is None and count > 1000:
+                    warm = memory_mb()
+        assert memory_mb() - warm < 20
+        good.step = 1
+        second = vectors(good.infer(seen(0, 1)))
+        good.close()
+    expected = alone(reacher, 0, 2)
+    assert np.array_equal(first[0], expected[0])
+    assert np.array_equal(second, expected[1]), "another client's episode has not noticed"
+    assert not trap.exists(), "code from the peer has run"
+    assert not [record for record in caplog.records if record.exc_info], "nothing failed inside"
+
+
+def test_a_frame_beyond_the_limit_ends_its_connection_only(reacher):
+    with serve(reacher) as server:
+        with connect(server.url, compression=None, max_size=None) as connection:
+            connection.send(b"\0" * (codec.MAX_BYTES + 1))
+            with pytest.raises(ConnectionClosed):
+                connection.recv(timeout=60)
+        client = Client(server.url)
+        assert client.ask("heartbeat")["message_type"] == "heartbeat_ack"
+        client.close()
+
+
+def test_a_web_page_cannot_connect_and_the_server_is_on_this_machine_only(reacher):
+    with serve(reacher) as server:
+        assert server.url.startswith("ws://127.0.0.1:")
+        with pytest.raises(InvalidStatus), connect(server.url, origin="http://example.org"):
+            pass
+
+
+def test_every_kind_of_request_gets_the_reply_of_its_name(reacher):
+    with serve(reacher) as server:
+        client = Client(server.url)
+        for kind, answer in (("prepare_case", "prepare_case_ack"), ("reset", "reset_result"), ("hello", "hello_ack")):
+            assert client.ask(kind)["message_type"] == answer
+        assert client.ask("trial_end", {"success": True})["message_type"] == "trial_end_ack"
+        reply = client.ask("infer", {"observation": seen(3, 0)}, step=0, repeat_index=7, action_case_id="case")
+        assert (reply["repeat_index"], reply["action_case_id"], reply["step"]) == (7, "case", 0)
+        assert reply["payload"]["latency_ms"] > 0
+        client.connection.send(encode(request("close")))
+        with pytest.raises(ConnectionClosed):
+            client.connection.recv(timeout=60)
+
+
+def test_a_failure_inside_the_policy_is_told_without_its_traceback(reacher, monkeypatch, caplog):
+    with serve(reacher) as server:
+        monkeypatch.setattr(server.model.deployment, "act", lambda seen: 1 / 0)
+        client = Client(server.url)
+        reply = client.ask("infer", {"observation": seen(0, 0)})
+        client.close()
+    assert reply["payload"]["code"] == "infer_failed"
+    assert "ZeroDivisionError" not in str(reply)
+    assert "ZeroDivisionError" in caplog.text, "the log of the server has it"
+
+
+def test_a_port_that_is_taken_is_an_error_that_says_so(reacher):
+    with serve(reacher) as server, pytest.raises(ConfigError, match=str(server.port)):
+        PolicyServer(server.model, port=server.port).__enter__()
+
+
+def test_a_resent_request_moves_nothing_on(reacher):
+    model, expected = Model({"checkpoint": str(reacher)}), alone(reacher, 0, 3)
+    for step in range(3):
+        for request_name in (f"{step}", f"{step}", None, "another name after a reconnect"):
+            actions = model.infer(seen(0, step), step=step, request=request_name)
+            assert np.array_equal(vectors(actions), expected[step])
+    with pytest.raises(ProtocolError, match="step 2 or later"):
+        model.infer(seen(0, 1), step=1)
+    model.reset()
+    model.update_obs(seen(0, 0))
+    direct = model.get_action()
+    assert np.array_equal(vectors(direct), expected[0])
+    assert model.get_action() is direct, "asked again without a new observation"
+    model.update_obs(seen(0, 0))
+    model.update_obs(seen(0, 1))
+    assert np.array_equal(vectors(model.get_action()), expected[1]), "an observation nobody asked about is no step"
+
+
+def test_a_client_that_does_not_count_its_steps_still_moves_on(reacher):
+    model, expected = Model({"checkpoint": str(reacher)}), alone(reacher, 0, 4)
+    for step in range(4):
+        assert np.array_equal(vectors(model.infer(seen(0, step), step=0, request=str(step))), expected[step])
+
+
+def test_batched_calls_give_what_single_ones_give_in_the_order_asked_for(reacher):
+    model = Model({"checkpoint": str(reacher), "execution": 3})
+    expected = {index: alone(reacher, index, 2, 3) for index in (4, 0, 7)}
+    for step in range(2):
+        model.update_obs_batch([seen(index, step) for index in (4, 0, 7)])
+        for order in ((7, 4, 0), (0,), (4, 0, 7)):
+            for index, actions in zip(order, model.get_action_batch(order), strict=True):
+                assert len(actions) == 3
+                assert np.array_equal(vectors(actions), expected[index][step])
+    with pytest.raises(ProtocolError, match="update_obs"):
+        model.get_action_batch([4, 5])
+    with pytest.raises(ProtocolError, match="update_obs"):
+        Model({"checkpoint": str(reacher)}).get_action()
+
+
+def test_a_reset_forgets_the_environments_of_its_own_client_only(reacher):
+    model, expected = Model({"checkpoint": str(reacher)}), alone(reacher, 0, 3)
+    for client in ("one", "two"):
+        for step in range(2):
+            model.infer(seen(0, step), session=client, step=step)
+    model.reset(session="one")
+    assert np.array_equal(vectors(model.infer(seen(0, 0), session="one", step=0)), expected[0])
+    assert np.array_equal(vectors(model.infer(seen(0, 2), session="two", step=2)), expected[2])
+    model.reset({"scene": 3})  # as the older protocol calls it
+    assert np.array_equal(vectors(model.infer(seen(0, 0))), expected[0])
+
+
+def test_an_episode_whose_beginning_is_not_known_is_refused_and_not_begun_anew(reacher):
+    model = Model({"checkpoint": str(reacher), "environments": 2})
+    with pytest.raises(ProtocolError, match="Reset"):
+        model.infer(seen(0, 3), step=3)  # the server was restarted
+    for index in range(3):
+        model.infer(seen(index, 0), step=0)
+    with pytest.raises(ProtocolError, match="environment 0"):
+        model.infer(seen(0, 1), step=1)  # its place has been taken
+    assert np.array_equal(vectors(model.infer(seen(2, 1), step=1)), alone(reacher, 2, 2)[1])
+    with pytest.raises(ConfigError, match="environments"):
+        model.update_obs_batch([seen(index, 0) for index in range(3)])
+
+
+def test_a_single_arm_has_names_without_a_side(tmp_path):
+    policy, ones = tiny_act(cameras=("cam_high",), state_dim=7, action_dim=7, fitted=False), torch.ones(7)
+    policy.set_statistics(Statistics(*[0 * ones, ones, -ones, ones] * 2))
+    model = Model({"checkpoint": str(save(policy, tmp_path / "a.ckpt"))})
+    both = seen(0, 0)
+    for arm in ("arm_joint_state", "joint_state"):
+        single = {**both, "state": {arm: np.zeros(6, np.float32), "ee_joint_state": np.zeros(1, np.float32)}}
+        actions = model.infer(single)
+        assert list(actions[0]) == [arm, "ee_joint_state"]
+        assert actions[0][arm].shape == (6,)
+    with pytest.raises(ProtocolError, match="7 numbers"):
+        model.infer(both)
+
+
+def test_arrays_and_scalars_survive_the_way_and_nothing_else_is_an_array():
+    rng = np.random.default_rng(0)
+    arrays = [rng.integers(0, 256, (2, 3, 3), dtype=np.uint8), rng.normal(size=5).astype(">f8"), np.zeros((0, 2), bool)]
+    message = {"arrays": arrays, "scalar": np.float32(1.5), "text": "é", "nothing": None, "nested": [{"a": [1, 2]}]}
+    for frame in (codec.pack(message), msgpack.packb(message, default=array_to_map)):
+        found = codec.unpack(frame)
+        for ours, theirs in zip(found["arrays"], arrays, strict=True):
+            assert ours.dtype == theirs.dtype
+            assert np.array_equal(ours, theirs)
+        assert found["scalar"] == 1.5
+        assert found["nested"] == [{"a": [1, 2]}]
+    for value in (np.array([object()]), np.array(["a"]), object()):
+        with pytest.raises(TypeError):
+            codec.pack({"value": value})
+
+
+def test_an_envelope_has_its_fields_and_no_others():
+    frame = read_frame(request("infer", {"observation": {}}, step=3, action_case_id="case", repeat_index=1))
+    assert (frame.message_type, frame.step, frame.session) == ("infer", 3, ("evaluation", "trial"))
+    assert frame.reply("infer_result", {"actions": []}).to_message() | {"sent_at": ""} == {
+        **request("infer_result", {"actions": []}, step=3, action_case_id="case", repeat_index=1),
+        "message_id": frame.message_id,
+        "sent_at": "",
+    }
+
+
+def test_a_checkpoint_is_found_by_xpolicylabs_name_of_a_run(reacher, tmp_path):
+    run = {"bench_name": "RoboTwin", "ckpt_name": "first", "env_cfg_type": "arx_x5", "action_type": "joint", "seed": 0}
+    with pytest.raises(CheckpointError, match="RoboTwin-first-arx_x5-joint-0"):
+        find_checkpoint(run, tmp_path)
+    for folder in ("first", "RoboTwin-first-arx_x5-joint-0"):
+        place = tmp_path / "checkpoints" / folder / "policy_best.ckpt"
+        place.parent.mkdir(parents=True)
+        place.write_bytes(reacher.read_bytes())
+        assert find_checkpoint(run, tmp_path) == place
+    assert Model(run, tmp_path).infer(seen(0, 0))
+    with pytest.raises(ConfigError, match="joint"):
+        Model({**run, "action_type": "ee"}, tmp_path)
+
+
+def test_the_scripts_are_valid_say_how_to_call_them_and_start_the_server(reacher, tmp_path):
+    folder = tmp_path / "XPolicyLab" / "policy" / "UGR"
+    write_adapter(reacher, folder)
+    names = {"README.md", "__init__.py", "install.sh", "process_data.sh", "train.sh", "eval.sh", "deploy.yml"}
+    names |= {"setup_eval_policy_server.sh", "setup_eval_env_client.sh", "deploy.py", "model.py"}
+    assert {path.name for path in folder.iterdir()} == names
+    for script in folder.glob("*.sh"):
+        assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
+        if script.name != "process_data.sh":
+            called = subprocess.run(["bash", script], capture_output=True, text=True, check=False)
+            assert called.returncode == 2
+            assert script.name in called.stderr
+    (tmp_path / "venv" / "bin").mkdir(parents=True)
+    ugr = tmp_path / "venv" / "bin" / "ugr"
+    ugr.write_text('#!/bin/bash\necho "$@"\n')
+    ugr.chmod(0o755)
+    arguments = ["RoboTwin", "click", "first", "arx_x5", "joint", "0", "0", str(tmp_path / "venv"), "5000"]
+    command = ["bash", folder / "setup_eval_policy_server.sh", *arguments]
+    called = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert called.stdout.startswith(f"bridge serve --folder {folder} --bench_name RoboTwin --task_name click")
+    assert called.stdout.endswith("--seed 0 --port 5000 --host localhost\n")
+
+
+def test_without_the_extra_the_error_says_what_to_install(monkeypatch):
+    monkeypatch.setitem(sys.modules, "msgpack", None)
+    with pytest.raises(ConfigError, match=r"ugr-lightning\[xpolicylab\]"):
+        PolicyServer(types.SimpleNamespace())
+
+
+def test_the_environments_side_needs_nothing_of_ours(adapter, reacher):
+    adapter(reacher)
+    program = "import sys; sys.path.insert(0, sys.argv[1]); import XPolicyLab.policy.UGR.deploy; print(*sys.modules)"
+    root = Path(importlib.import_module("XPolicyLab").__file__).parents[1]
+    called = subprocess.run([sys.executable, "-c", program, root], capture_output=True, text=True, check=True)
+    assert "ugr_lightning" not in called.stdout.replace("__editable__", "")
+    assert "torch" not in called.stdout.split()
+
+
+def test_serving_in_a_thread_ends_with_its_block(reacher):
+    before = threading.active_count()
+    with serve(reacher) as server:
+        client = Client(server.url)
+    with pytest.raises(ConnectionClosed):
+        client.ask("heartbeat")
+    client.close()
+    assert threading.active_count() <= before + 1  # the client's own receiver may take a moment to end

@@ -1,0 +1,87 @@
+"""`ugr bridge` from the command line."""
+
+import signal
+import subprocess
+import sys
+
+import pytest
+import torch
+import yaml
+
+from ugr_lightning.cli.main import main
+from ugr_lightning.models.act import ACT
+from ugr_lightning.training.checkpoint import describe
+
+TINY = {"dim": 16, "feedforward": 32, "heads": 2, "encoder_layers": 1, "decoder_layers": 1, "cvae_layers": 0}
+TINY |= {"backbone_width": 4, "backbone_norm": "batch", "precision": "fp32", "chunk_length": 10}
+
+
+class Data:
+    task, setting, state, image_size = "click_alarmclock", "demo_clean", "commanded", (30, 40)
+
+
+@pytest.fixture(scope="module")
+def checkpoints(tmp_path_factory):
+    """A checkpoint with statistics and one without."""
+    folder = tmp_path_factory.mktemp("run")
+    policy = ACT(**TINY)
+    for name in ("unfitted.ckpt", "policy_best.ckpt"):
+        weights = {f"policy.{key}": value for key, value in policy.state_dict().items()}
+        torch.save({"policy": describe(policy, Data()), "state_dict": weights}, folder / name)
+        policy.normalizer.fitted.fill_(True)
+    return folder
+
+
+@pytest.mark.parametrize("evaluator", ["robotwin", "xpolicylab"])
+def test_a_folder_is_written_with_the_settings_asked_for(checkpoints, tmp_path, capsys, evaluator):
+    folder, file = tmp_path / "policy" / "Mine", checkpoints / "policy_best.ckpt"
+    options = ["--execution", "5", "--cameras.cam_high", "overhead"]
+    assert main(["bridge", evaluator, "--ckpt", str(file), "--out", str(folder), *options]) == 0
+    assert str(folder / "eval.sh") in capsys.readouterr().out
+    settings = yaml.safe_load(
+        (folder / {"robotwin": "deploy_policy.yml", "xpolicylab": "deploy.yml"}[evaluator]).read_text()
+    )
+    assert settings["policy_name"] == "Mine"
+    assert settings["execution"] == 5
+    assert settings["cameras"]["cam_high"] == "overhead"
+    assert settings["cameras"]["cam_left_wrist"] in ("left_camera", "cam_left_wrist")
+    assert settings["checkpoint"] == str(file.resolve())
+
+
+@pytest.mark.parametrize("evaluator", ["robotwin", "xpolicylab"])
+def test_a_checkpoint_without_statistics_is_refused_and_nothing_written(checkpoints, tmp_path, capsys, evaluator):
+    file, folder = checkpoints / "unfitted.ckpt", tmp_path / "UGR"
+    assert main(["bridge", evaluator, "--ckpt", str(file), "--out", str(folder)]) == 2
+    assert "statistics" in capsys.readouterr().err
+    assert not folder.exists()
+
+
+def test_the_evaluators_are_listed_and_a_wrong_name_is_an_error(capsys):
+    assert main(["bridge", "--help"]) == 0
+    assert "ugr bridge xpolicylab" in capsys.readouterr().out
+    for wrong in (["bridge"], ["bridge", "robottwin"], ["bridge", "serve"]):
+        assert main(wrong) == 2
+        assert "ugr bridge" in capsys.readouterr().err
+
+
+def test_a_served_checkpoint_answers_until_it_is_interrupted(checkpoints):
+    pytest.importorskip("msgpack", reason="the extra `xpolicylab` is not installed")
+    client = pytest.importorskip("websockets.sync.client", reason="the extra `xpolicylab` is not installed")
+    command = [sys.executable, "-m", "ugr_lightning.cli.main", "bridge", "serve", "--port", "0"]
+    command += ["--ckpt", str(checkpoints / "policy_best.ckpt")]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with subprocess.Popen(command, **pipes) as process:
+        try:
+            assert process.stdout is not None
+            assert process.stdout.readline().startswith("policy: ACT of")
+            url = process.stdout.readline().split()[-1]
+            assert url.startswith("ws://127.0.0.1:")
+            with client.connect(url) as connection:
+                connection.send(b"nonsense")
+                assert b"invalid_frame" in connection.recv(timeout=60)
+                process.send_signal(signal.SIGINT)
+                _, errors = process.communicate(timeout=60)
+        finally:
+            process.kill()
+    assert process.returncode == 130
+    assert errors.strip() == "ugr bridge: interrupted"
