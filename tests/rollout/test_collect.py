@@ -13,6 +13,7 @@ import pytest
 from fake_simulator import STEPS, FakeSimulator
 
 from ugr_lightning.data.folder import episode_path, find_episodes, read_scene_info, read_seeds
+from ugr_lightning.data.formats import find_format
 from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.rollout.collect import collect
@@ -155,6 +156,14 @@ def test_episodes_from_elsewhere_are_enough_or_an_error(reference, tmp_path):
     with pytest.raises(DataError, match="1 episodes from elsewhere"):
         record(tmp_path, episodes=2)
     assert [path.name for path in tmp_path.glob("*/*")] == ["episode0.hdf5"]
+
+
+def test_nothing_is_recorded_into_a_folder_of_another_format(reference, tmp_path):
+    find_format("act").write(tmp_path, [read_episode(episode_path(reference, 0))])
+    before = sorted(path.name for path in tmp_path.iterdir())
+    with pytest.raises(DataError, match="a folder to record into, got demonstrations of the format act"):
+        record(tmp_path, episodes=2)
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
 
 
 def test_a_seed_that_kills_its_process_is_tried_again(tmp_path, capsys):

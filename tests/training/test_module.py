@@ -6,8 +6,8 @@ import torch
 from lightning.pytorch import Trainer
 from tiny import TinyData, TinyPolicy, TinySamples, collate, train
 
-from ugr_lightning.errors import NumericsError
-from ugr_lightning.training.module import PolicyModule, found_by
+from ugr_lightning.errors import ConfigError, NumericsError
+from ugr_lightning.training.module import PolicyModule, check_fit, found_by
 
 QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
 
@@ -104,3 +104,17 @@ def test_a_module_is_made_without_warnings():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         PolicyModule(TinyPolicy())
+
+
+@pytest.mark.parametrize(
+    ("wanted", "message"),
+    [
+        ({"dim": 4}, r"made for \(state 4, action 4, cameras cam_high\), got state 3, action 3, cameras cam_high"),
+        ({"cameras": ("cam_high", "top")}, r"cameras cam_high, top\), got .*cameras cam_high\."),
+    ],
+)
+def test_a_policy_made_for_another_robot_is_refused_with_both_sides_shown(wanted, message):
+    statistics = TinyData().statistics
+    check_fit(TinyPolicy(), statistics, ["cam_high"])
+    with pytest.raises(ConfigError, match=message):
+        check_fit(TinyPolicy(**wanted), statistics, ["cam_high"])

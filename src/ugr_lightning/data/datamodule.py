@@ -14,7 +14,7 @@ from ugr_lightning.contract import CAMERAS, CHUNK_LENGTH, Batch, Statistics
 from ugr_lightning.data.cache import Cache, open_frames
 from ugr_lightning.data.chunks import AfterEnd, ChunkDataset, ProprioceptionKind
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.formats import EpisodeFormat, EpisodeLocation, detect, episode_files, recognise
+from ugr_lightning.data.formats import RECORDED, EpisodeFormat, EpisodeLocation, detect, episode_files, recognise
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.data.sampling import BatchSampler, EpochOrder, Sampling
 from ugr_lightning.data.split import Split, split_episodes
@@ -41,7 +41,6 @@ class Recording:
     workers: int = 2
 
 
-RECORDED = "robotwin"  # the format that demonstrations are recorded in
 DEFAULT_SAMPLING = Sampling()
 DEFAULT_RECORDING = Recording()
 

@@ -20,14 +20,14 @@ from ugr_lightning.data.folder import (
     write_scene_info,
     write_seeds,
 )
-from ugr_lightning.data.formats import recognise
+from ugr_lightning.data.formats import RECORDED, recognise
 from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.progress import Progress
 from ugr_lightning.rollout.recorder import Outcome, Recorder, publish_text, staged_episode, staged_scene, staged_video
 from ugr_lightning.rollout.workers import Worker, WorkerLostError, open_simulator, start_all, wait_for_any
 from ugr_lightning.sim.settings import check_setting
-from ugr_lightning.sim.tasks import check_task, task_names, task_summaries, task_version
+from ugr_lightning.sim.tasks import all_task_names, check_task, task_summaries, task_version
 
 EPISODE_TIMEOUT_S = 600.0
 """No expert takes that long; a simulator that does has hung."""
@@ -83,6 +83,10 @@ def collect(
     if simulator is None and not find_episodes(folder):
         check_task(task)
         check_setting(setting)
+    foreign = [form.name for form in recognise(folder) if form.name != RECORDED]
+    if foreign:
+        got = f"demonstrations of the format {foreign[0]}"
+        raise DataError(folder, "a folder to record into", got, "Record into another folder.")
     folder.mkdir(parents=True, exist_ok=True)
     settings = _settings(task, setting, image_size, noise, first_seed)
     with (folder / "recording.lock").open("w") as lock:
@@ -224,7 +228,7 @@ def _settings(task: str, setting: str, image_size: tuple[int, int], noise: Noise
         "image_size": list(image_size),
         "noise": asdict(noise),
         "first_seed": first_seed,
-        "task_version": task_version(task) if task in task_names() else None,
+        "task_version": task_version(task) if task in all_task_names() else None,
     }
 
 
@@ -244,10 +248,9 @@ def _is_complete(folder: Path, episodes: int, settings: dict[str, Any]) -> bool:
     if set(range(episodes)) <= present:
         return True
     if not path.is_file():
-        foreign = ", ".join(form.name for form in recognise(folder))
-        if present or foreign:
+        if present:
             fix = "Record into another folder, or ask for no more episodes than there are."
-            got = f"{len(present) or foreign} episodes from elsewhere (no recording.json)"
+            got = f"{len(present)} episodes from elsewhere (no recording.json)"
             raise DataError(folder, f"an empty folder or {episodes} episodes", got, fix)
         content = json.dumps({**settings, "package_version": version("ugr-lightning")}, indent=2) + "\n"
         publish_text(path, content)

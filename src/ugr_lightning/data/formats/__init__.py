@@ -18,6 +18,7 @@ from ugr_lightning.data.hdf5 import open_hdf5
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import ConfigError, DataError
 
+RECORDED = "robotwin"  # the format that we record in
 PEEKED = 8  # files of a folder that are looked into to recognise it
 
 
