@@ -8,6 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ugr_lightning.contract import CAMERAS
+
 HOME = np.tile(np.array([0, -0.9, 1.1, 0, -0.3, 0, 1], np.float32), 2)
 GOAL = 0.4
 STEPS = 12
@@ -36,6 +38,7 @@ class FakeSimulator:
     the expert gives up on the seeds 3, 8, 13, ...
     """
 
+    cameras = CAMERAS
     control_hz = 25.0
     horizon = 20
     task_version = 1

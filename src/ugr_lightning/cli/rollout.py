@@ -99,13 +99,13 @@ def roll_out(
     """
     import tempfile
 
-    from ugr_lightning.contract import CAMERAS
     from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.rollout.actors import DUMMIES, Actor, PolicyActor, make_actor
     from ugr_lightning.rollout.lockstep import EpisodeTrace
     from ugr_lightning.rollout.results import append_result
     from ugr_lightning.rollout.runner import run_episodes
     from ugr_lightning.rollout.traces import write_trace
+    from ugr_lightning.sim.outside import task_cameras
     from ugr_lightning.sim.render import require_rendering
     from ugr_lightning.sim.seeds import seeds_hash
     from ugr_lightning.training.checkpoint import load_policy
@@ -123,18 +123,16 @@ def roll_out(
             fix = "For a run's checkpoint use `ugr test --run NAME`, or give the file."
             raise ConfigError("--policy", f"one of {', '.join(DUMMIES)}, or a checkpoint file", policy, fix)
         model, info = load_policy(policy)
-        missing = sorted(set(model.cameras) - set(CAMERAS))
-        if missing:
-            raise ConfigError("cameras", f"cameras of the simulator, {CAMERAS}", missing, "Use another checkpoint.")
         trained, sha, name = info.data, info.sha256, type(model).__name__
         if refine_ratio is not None:
             model, name = with_refine_ratio(model, refine_ratio), f"{name}(refine_ratio={refine_ratio:g})"
-        actor = PolicyActor(model.for_inference(), name=name, state=trained.get("state", "commanded"))  # type: ignore[arg-type]
-    task = task or trained.get("task")  # type: ignore[assignment]
+        task = task or trained.get("task")  # type: ignore[assignment]
+        state, seen = trained.get("state", "commanded"), task_cameras(str(task))
+        actor = PolicyActor(model.for_inference(), name=name, state=state, cameras=seen)  # type: ignore[arg-type]
     if task is None:
         raise ConfigError("--task", "a task", "none", "`ugr tasks` lists them.")
     if actor.cameras or video is not None:
-        require_rendering()
+        require_rendering(task)
     wanted, whole = seed_list(seeds, str(task), episodes)
     setting = setting or str(trained.get("setting", "demo_clean"))
     stamp = (str(task), setting, seeds_hash(whole), actor.name, sha, str(execution))

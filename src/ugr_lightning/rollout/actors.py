@@ -1,7 +1,7 @@
 """What can act in the simulator: a policy, and the dummies `zero`, `random` and `expert` to compare it with."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -139,19 +139,25 @@ class PolicyActor(Actor):
         policy: predicts the chunks.
         name: what results call it; None takes the name of its class.
         state: what it sees of the joints, `commanded` or `measured`; as in its training.
+        cameras: those of the simulator, in the order of its frames.
     """
 
     def __init__(
-        self, policy: ChunkPolicy, *, name: str | None = None, state: Literal["commanded", "measured"] = "commanded"
+        self,
+        policy: ChunkPolicy,
+        *,
+        name: str | None = None,
+        state: Literal["commanded", "measured"] = "commanded",
+        cameras: Sequence[str] = CAMERAS,
     ) -> None:
-        unknown = [camera for camera in policy.cameras if camera not in CAMERAS]
+        unknown = [camera for camera in policy.cameras if camera not in cameras]
         if unknown:
             fix = "Roll out a policy that was trained on these cameras."
-            raise CheckpointError("policy.cameras", f"cameras among {', '.join(CAMERAS)}", ", ".join(unknown), fix)
+            raise CheckpointError("policy.cameras", f"cameras among {', '.join(cameras)}", ", ".join(unknown), fix)
         self.policy, self.state = policy, state
         self.name = name or type(policy).__name__
         self.cameras = tuple(policy.cameras)
-        self._views = [CAMERAS.index(camera) for camera in self.cameras]
+        self._views = [list(cameras).index(camera) for camera in self.cameras]
         self._execution: Execution | None = None
         self._was_training = False
 

@@ -175,6 +175,7 @@ class Recorder:
                 control_hz=simulator.control_hz,
                 noise={**asdict(self._noise), "attempt": attempt},
                 task_version=simulator.task_version,
+                cameras=simulator.cameras,
             )
         except OSError as error:
             fix = "Make room or correct the permissions and run the same command again: it goes on where it stopped."

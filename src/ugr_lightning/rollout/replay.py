@@ -13,7 +13,7 @@ from ugr_lightning.rollout.progress import Progress
 from ugr_lightning.rollout.spread import spread
 from ugr_lightning.rollout.workers import open_simulator
 from ugr_lightning.sim.settings import check_setting
-from ugr_lightning.sim.tasks import task_names, task_version
+from ugr_lightning.sim.tasks import all_task_names, task_version
 
 
 class Replay(NamedTuple):
@@ -110,7 +110,7 @@ def replay(
 
 
 def _require_this_version(recorded: Executed) -> None:
-    if recorded.task not in task_names():
+    if recorded.task not in all_task_names():
         fix = "Replay it where its task is installed."
         raise DataError(recorded.path, "a recording of a task that is here", recorded.task, fix)
     check_setting(recorded.setting)

@@ -178,7 +178,7 @@ def survey(
         progress: whether to show progress lines.
         simulator: what to open in place of `sim.Simulator`.
     """
-    from ugr_lightning.sim.tasks import task_names, task_version
+    from ugr_lightning.sim.tasks import all_task_names, task_version
 
     seeds = list(range(first_seed, first_seed + episodes))
     shared = {"setting": setting, "progress": progress, "simulator": simulator}
@@ -191,7 +191,7 @@ def survey(
     return Survey(
         task=task,
         setting=setting,
-        task_version=task_version(task) if task in task_names() else None,
+        task_version=task_version(task) if task in all_task_names() else None,
         first_seed=first_seed,
         expert=Rate.of([item.success for item in performances]),
         zero=Rate.of([item.success for item in dummies.get("zero", [])]),

@@ -211,14 +211,14 @@ def open_simulator(simulator: Callable[..., Any] | None, task: str, **settings: 
     """Open a simulator in this process and show it one scene: the first picture of a process compiles shaders.
 
     Args:
-        simulator: what to call in place of `sim.Simulator`, or None.
+        simulator: what to call in place of the task's own simulator, or None.
         task: task name.
         settings: keyword arguments of `sim.Simulator`.
     """
     if simulator is None:
-        from ugr_lightning.sim.simulator import Simulator
+        from ugr_lightning.sim.outside import simulator_of
 
-        simulator = Simulator
+        simulator = simulator_of(task)
     opened = simulator(task, **settings)
     opened.reset(0)
     return opened

@@ -30,7 +30,7 @@ class Frame(NamedTuple):
     """Everything measurable at one control step.
 
     Args:
-        images: (V, H, W, 3) uint8 RGB in the order of `contract.CAMERAS`; (0, H, W, 3) where nobody looks.
+        images: (V, H, W, 3) uint8 RGB in the order of the simulator's `cameras`; (0, H, W, 3) where nobody looks.
         commanded: (14,) float32, the joint targets in force: home after reset, else the last action, clipped.
         measured: (14,) float32, gripper 0 closed .. 1 open.
         endpose: (2, 7) float64, world tool pose of the left and the right arm: x y z qw qx qy qz.
@@ -62,6 +62,9 @@ class Simulator:
         ConfigError: unknown task or setting, or an impossible image size or speed.
         SimulationError: SAPIEN is not installed.
     """
+
+    cameras = CAMERAS
+    """Names of the pictures of a frame, in their order."""
 
     def __init__(
         self,

@@ -68,6 +68,7 @@ def write_episode(
     control_hz: float,
     noise: Mapping[str, Any] | None = None,
     task_version: int | None = None,
+    cameras: Sequence[str] = CAMERAS,
 ) -> None:
     """Write one episode of N decision steps, hence N + 1 frames, so that it is either complete on disk or absent.
 
@@ -76,7 +77,7 @@ def write_episode(
 
     Args:
         path: final file, see `data.folder.episode_path`; folders are made, and `<path>.partial` is renamed to it.
-        images: (N + 1, V, H, W, 3) uint8 RGB in the order of `contract.CAMERAS`; or N + 1 items of V JPEGs each, as
+        images: (N + 1, V, H, W, 3) uint8 RGB in the order of `cameras`; or N + 1 items of V JPEGs each, as
             `data.jpeg.encode_frame` makes them, to keep memory low while recording.
         commanded: (N + 1, 14) joint targets in force, robot units.
         measured: (N + 1, 14) measured joints, robot units.
@@ -86,13 +87,14 @@ def write_episode(
         phase: N names of the motion that each step belongs to.
         slack: (N,) how much execution noise each step tolerates, 0 to 1.
         camera_parameters: N + 1 items of `Simulator.camera_parameters()`, or one for cameras that never move;
-            by camera name of `contract.CAMERAS`: intrinsic_cv (3, 3), extrinsic_cv (3, 4), cam2world_gl (4, 4).
+            by camera name: intrinsic_cv (3, 3), extrinsic_cv (3, 4), cam2world_gl (4, 4).
         task: task name.
         setting: scene setting.
         seed: simulator seed.
         control_hz: decision steps per second.
         noise: how noise was injected, plain values; None for none.
         task_version: version of the task; None where it has none.
+        cameras: names of the cameras.
 
     Raises:
         DataError: an array of another shape, or NaN or infinity in one; nothing is written.
@@ -112,8 +114,8 @@ def write_episode(
     }
     if len(phase) != steps:
         raise DataError(f"{path}:phase", f"{steps} names", len(phase), "Give one phase per step.")
-    jpegs = _encoded(path, images, steps + 1)
-    parameters = _camera_arrays(path, camera_parameters, steps + 1)
+    jpegs = _encoded(path, images, steps + 1, cameras)
+    parameters = _camera_arrays(path, camera_parameters, steps + 1, cameras)
 
     def fill(file: h5py.File) -> None:
         file.attrs["ugr_format_version"] = FORMAT_VERSION
@@ -124,8 +126,8 @@ def write_episode(
         for name, text in {**texts, "package_version": version("ugr-lightning")}.items():
             file.attrs[name] = np.bytes_(text.encode())  # fixed width: see `read_attribute`
         _write_robot(file, commanded, endpose)
-        for camera, disk in DISK_CAMERAS.items():
-            group = file.create_group(f"observation/{disk}")
+        for camera in cameras:
+            group = file.create_group(f"observation/{DISK_CAMERAS.get(camera, camera)}")
             group["rgb"] = np.array(jpegs[camera], dtype=bytes)  # (N + 1,) S{longest}, padded with NUL
             for name, values in parameters[camera].items():
                 group[name] = values
@@ -159,10 +161,12 @@ def _checked(path: Path, key: str, values: np.ndarray, shape: tuple[int, ...]) -
     return array
 
 
-def _encoded(path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames: int) -> dict[str, list[bytes]]:
+def _encoded(
+    path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames: int, cameras: Sequence[str]
+) -> dict[str, list[bytes]]:
     """JPEG bytes by camera, one per frame."""
-    wanted = f"{frames} frames of {len(CAMERAS)} uint8 pictures (H, W, 3) or JPEGs"
-    if len(images) != frames or any(len(frame) != len(CAMERAS) for frame in images):
+    wanted = f"{frames} frames of {len(cameras)} uint8 pictures (H, W, 3) or JPEGs"
+    if len(images) != frames or any(len(frame) != len(cameras) for frame in images):
         raise DataError(f"{path}:images", wanted, f"{len(images)} frames", "Nothing was written.")
     if isinstance(images, np.ndarray):
         if images.dtype != np.uint8 or images.ndim != 5 or images.shape[-1] != 3:
@@ -174,18 +178,18 @@ def _encoded(path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames:
                 jpeg_size(bytes(data))
             except ValueError as error:
                 raise DataError(f"{path}:images[{step}]", "JPEGs", str(error), "Nothing was written.") from error
-    return {camera: [bytes(frame[v]) for frame in images] for v, camera in enumerate(CAMERAS)}
+    return {camera: [bytes(frame[v]) for frame in images] for v, camera in enumerate(cameras)}
 
 
 def _camera_arrays(
-    path: Path, parameters: CameraParameters | Sequence[CameraParameters], frames: int
+    path: Path, parameters: CameraParameters | Sequence[CameraParameters], frames: int, cameras: Sequence[str]
 ) -> dict[str, dict[str, np.ndarray]]:
     """By camera and name, an array with one matrix per frame."""
     rows = [parameters] * frames if isinstance(parameters, Mapping) else list(parameters)
     if len(rows) != frames:
         raise DataError(f"{path}:camera_parameters", f"{frames} items", len(rows), "Nothing was written.")
     arrays: dict[str, dict[str, np.ndarray]] = {}
-    for camera in CAMERAS:
+    for camera in cameras:
         arrays[camera] = {}
         for name, shape in CAMERA_PARAMETERS.items():
             try:

@@ -56,11 +56,11 @@ def compute_evaluation_seeds(task: str, count: int = COUNT) -> dict[str, Any]:
     Raises:
         SimulationError: the expert fails on more than half of the seeds.
     """
-    from ugr_lightning.sim.simulator import Simulator
+    from ugr_lightning.sim.outside import simulator_of
 
     solved: list[int] = []
     skipped: list[int] = []
-    with Simulator(task, render=False) as simulator:
+    with simulator_of(task)(task, render=False) as simulator:
         seed = EVALUATION_START
         while len(solved) < count:
             success = simulator.reset(seed).success

@@ -1,4 +1,7 @@
-"""The tasks: one file each, found by listing this folder. Nothing here imports SAPIEN until a task is loaded."""
+"""The tasks: one file each, found by listing this folder. Nothing here imports SAPIEN until a task is loaded.
+
+Environments made by others are in `sim.outside`; their names, summaries and versions are found here as well.
+"""
 
 import ast
 import difflib
@@ -7,19 +10,24 @@ from pathlib import Path
 from typing import Any
 
 from ugr_lightning.errors import ConfigError, SimulationError
+from ugr_lightning.sim.outside import outside_names
 
 
 def task_names() -> tuple[str, ...]:
-    """Names of all tasks, sorted."""
+    """Names of our own tasks, sorted."""
     return tuple(sorted(path.stem for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")))
 
 
+def all_task_names() -> tuple[str, ...]:
+    """Names of our own tasks, then those of outside ones."""
+    return (*task_names(), *outside_names())
+
+
 def task_summaries() -> dict[str, str]:
-    """One line on each task, the first of its file."""
-    folder = Path(__file__).parent
+    """One line on each task, ours and outside ones, the first of its file."""
     summaries = {}
-    for name in task_names():
-        text = ast.get_docstring(ast.parse((folder / f"{name}.py").read_text(encoding="utf-8"))) or ""
+    for name in all_task_names():
+        text = ast.get_docstring(ast.parse(_path(name).read_text(encoding="utf-8"))) or ""
         summaries[name] = text.split("\n", 1)[0]
     return summaries
 
@@ -32,7 +40,7 @@ def task_version(name: str) -> int:
         SimulationError: its class states none.
     """
     check_task(name)
-    path = Path(__file__).parent / f"{name}.py"
+    path = _path(name)
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["version"]:
             return int(ast.literal_eval(node.value))
@@ -45,7 +53,7 @@ def check_task(name: str) -> None:
     Raises:
         ConfigError: there is no such task; the message names the closest ones.
     """
-    names = task_names()
+    names = all_task_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
         fix = f"Did you mean {' or '.join(close)}?" if close else "`ugr tasks` lists them."
@@ -53,7 +61,7 @@ def check_task(name: str) -> None:
 
 
 def named_tasks(which: str) -> tuple[str, ...]:
-    """The tasks that `all` or a name stands for.
+    """The tasks that `all`, which means our own, or a name stands for.
 
     Raises:
         ConfigError: neither.
@@ -62,6 +70,12 @@ def named_tasks(which: str) -> tuple[str, ...]:
         return task_names()
     check_task(which)
     return (which,)
+
+
+def _path(name: str) -> Path:
+    """The file of a task."""
+    folder = Path(__file__).parent
+    return (folder.parent / "outside" if name in outside_names() else folder) / f"{name}.py"
 
 
 def environment_id(name: str) -> str:

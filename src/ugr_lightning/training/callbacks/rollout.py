@@ -81,7 +81,7 @@ class RolloutEvaluation(Callback):
         try:
             from ugr_lightning.sim.render import require_rendering
 
-            require_rendering()
+            require_rendering(self.task)
         except (RenderError, ImportError) as error:
             if self.on_missing_renderer == "error":
                 raise
@@ -120,6 +120,7 @@ class RolloutEvaluation(Callback):
         self, trainer: Trainer, pl_module: LightningModule, videos: Path
     ) -> tuple[list[EpisodeResult], list[np.ndarray]]:
         """Results, and the s_k (K,) of each chunk of the first episode."""
+        from ugr_lightning.sim.outside import task_cameras
         from ugr_lightning.sim.seeds import SELECTION_START
 
         data = trainer.datamodule  # type: ignore[attr-defined]
@@ -134,7 +135,9 @@ class RolloutEvaluation(Callback):
                 uncertainty.extend(values for values in trace.log_variance if values is not None)
 
         results = run_episodes(
-            PolicyActor(policy.for_inference(), name=type(policy).__name__, state=data.state),
+            PolicyActor(
+                policy.for_inference(), name=type(policy).__name__, state=data.state, cameras=task_cameras(self.task)
+            ),
             self.task,
             seeds,
             setting=data.setting,
