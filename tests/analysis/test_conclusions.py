@@ -3,7 +3,7 @@ import re
 import pytest
 from made_up import drawn, evaluation
 
-from ugr_lightning.analysis.conclusions import conclude
+from ugr_lightning.analysis.conclusions import conclude, described_execution
 from ugr_lightning.analysis.report import build_report
 
 
@@ -68,6 +68,46 @@ def test_ten_episodes_that_agree_do_not_show_that_policies_are_equal():
     may, may_not = words(*(evaluation(p, [1] * 10, training_seed=t) for p in ("base", "uncert") for t in (0, 1)))
     assert may == ""
     assert "too few" in may_not
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.0, 0.6])
+@pytest.mark.parametrize(("n", "bound"), [(30, None), (100, "4%"), (400, "1%")])
+def test_policies_that_agree_on_every_episode_are_not_called_closer_than_their_number_allows(rate, n, bound):
+    solved = [1] * round(rate * n) + [0] * (n - round(rate * n))
+    report = build_report([evaluation(p, solved, training_seed=t) for p in ("base", "uncert") for t in (0, 1)])
+    (contest,) = report.contests
+    assert contest.interval == "Wilson"
+    assert contest.high == -contest.low == pytest.approx(1.96**2 / (n + 1.96**2), rel=1e-3)
+    conclusion = conclude(report)
+    if bound is None:
+        assert conclusion.may == []
+        assert "too few" in conclusion.may_not[0]
+    else:
+        assert f"differ by less than {bound} in click_alarmclock" in conclusion.may[0]
+
+
+def test_a_single_differing_episode_does_not_make_the_bound_tighter_than_none_does():
+    solved = [1] * 100
+    runs = [evaluation(p, solved, training_seed=t) for p in ("base", "uncert") for t in (0, 1)]
+    runs[0] = evaluation("base", [0, *solved[1:]], training_seed=0)
+    report = build_report(runs)
+    assert report.contests[0].high < 0.03  # of the bootstrap
+    assert "differ by less than 4% in" in conclude(report).may[0]
+
+
+def test_a_bound_is_rounded_up():
+    may, _ = words(*(drawn(p, 0.97, n=4000, seed=1) for p in ("base", "uncert")))
+    assert "differ by less than 1%" in may
+
+
+def test_every_execution_is_put_into_words():
+    runs = [evaluation(p, [1, 0] * 50, execution="aggregate-variance") for p in ("base", "uncert")]
+    assert "chunks aggregated with inverse variance" in words(*runs)[0]
+    assert [described_execution(name) for name in ("aggregate", "25", "own")] == [
+        "aggregated chunks",
+        "25 steps of each chunk",
+        "own",
+    ]
 
 
 def test_with_several_tasks_the_pooled_comparison_decides_and_single_tasks_are_mentioned():

@@ -3,10 +3,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
 from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.folder import episode_path, write_seeds
 from ugr_lightning.data.formats.robotwin import write_episode
+from ugr_lightning.models.act import ACT
+from ugr_lightning.models.refine.uncertainty import Uncertainty
+from ugr_lightning.training.checkpoint import describe
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tests" / "training"))
@@ -55,6 +60,55 @@ def ten_demonstrations(tmp_path):
         write_demonstration(folder, index)
     write_seeds(folder, range(10))
     return tmp_path / "ten"
+
+
+@pytest.fixture
+def untrained(ten_demonstrations):
+    """Writes `policy_best.ckpt` of a policy that was told the statistics of ten demonstrations and learned nothing."""
+
+    def write(policy, folder):
+        data = ChunkDataModule(
+            root=str(ten_demonstrations), episodes=10, chunk_length=policy.chunk_length, after_end="hold"
+        )
+        data.setup()
+        policy.set_statistics(data.statistics)
+        weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}
+        content = {"state_dict": weights, "policy": describe(policy, data), "global_step": 7, "epoch": 0}
+        folder.mkdir(parents=True, exist_ok=True)
+        torch.save(content, folder / "policy_best.ckpt")
+        return folder / "policy_best.ckpt"
+
+    return write
+
+
+@pytest.fixture
+def tiny_act():
+    """Builds an ACT of a few numbers that refines, with a branch and an uncertainty that do something."""
+
+    def build(refine=Uncertainty, chunk_length=10):
+        torch.manual_seed(0)
+        policy = ACT(
+            refine() if refine else None,
+            chunk_length=chunk_length,
+            dim=16,
+            feedforward=32,
+            heads=2,
+            encoder_layers=1,
+            decoder_layers=1,
+            cvae_layers=1,
+            latent_dim=4,
+            dropout=0.1,
+            backbone_width=4,
+            backbone_stem="unshuffle",
+            backbone_norm="batch",
+            precision="fp32",
+        )
+        if refine:
+            for layer in (policy.branch.head, policy.uncertainty_head):
+                torch.nn.init.normal_(layer.weight)
+        return policy
+
+    return build
 
 
 TINY = """

@@ -5,26 +5,17 @@ import json
 
 import numpy as np
 import pytest
-import torch
 from PIL import Image
 from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import CAMERAS
-from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.training.checkpoint import describe
 
 
 @pytest.fixture
-def command(ten_demonstrations, tmp_path):
+def command(ten_demonstrations, tmp_path, untrained):
     """The command line for a checkpoint of a policy that was told the statistics and learned nothing."""
-    data = ChunkDataModule(root=str(ten_demonstrations), episodes=10, chunk_length=5, after_end="hold")
-    data.setup()
-    policy = TinyPolicy(cameras=CAMERAS, dim=14)
-    policy.set_statistics(data.statistics)
-    weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}
-    content = {"state_dict": weights, "policy": describe(policy, data), "global_step": 7, "epoch": 0}
-    torch.save(content, tmp_path / "policy_best.ckpt")
+    untrained(TinyPolicy(cameras=CAMERAS, dim=14), tmp_path)
     return ["analyze", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations), "--resamples", "20"]
 
 
@@ -75,3 +66,28 @@ def test_what_a_policy_cannot_do_is_said_before_anything_is_computed(command, op
     said = capsys.readouterr()
     assert says in said.err
     assert "statistic" not in said.out
+
+
+def test_budgets_and_estimators_of_a_run_go_into_the_same_page(
+    ten_demonstrations, tmp_path, tiny_act, untrained, capsys
+):
+    untrained(tiny_act(), tmp_path / "runs" / "a" / "version_0")
+    command = f"analyze --run a --root {tmp_path}/runs --data {ten_demonstrations} --resamples 5 --budgets --estimators"
+    assert main(command.split()) == 0
+    folder = tmp_path / "runs" / "a" / "version_0" / "analysis-policy_best"
+    found = json.loads((folder / "analysis.json").read_text())
+    page, said = (folder / "analysis.md").read_text(), capsys.readouterr().out
+    budgets = found["budgets"]
+    assert budgets["ratios"] == [round(0.1 * tenth, 1) for tenth in range(11)]
+    coarse = found["generalisation"]["validation"]["mean error"]
+    for selector, intervals in budgets["error"].items():
+        assert intervals[0]["value"] == pytest.approx(coarse), selector
+        assert intervals[-1]["value"] == pytest.approx(budgets["error"]["learned"][-1]["value"]), selector
+    assert budgets["against_coarse"]["learned"][0] == {"value": 0.0, "low": 0.0, "high": 0.0}
+    assert budgets["against_coarse"]["learned"][-1]["value"] != 0, "the branch of this policy is not at its start"
+    names = [row[0] for row in found["estimators"]]
+    assert names == ["estimator", "s_k", "MC dropout", "CVAE samples", "overlapping chunks"]
+    for text in ("| 100% |", "| MC dropout |", "![budgets](budgets.png)"):
+        assert text in page
+    assert "overlapping chunks" in said
+    assert np.asarray(Image.open(folder / "budgets.png")).std() > 0

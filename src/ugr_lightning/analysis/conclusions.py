@@ -1,10 +1,12 @@
 """What may be concluded from a report and what may not, in words made from its numbers."""
 
+import math
 from dataclasses import dataclass, replace
 
 from ugr_lightning.analysis.power import LARGEST, paired_episodes
 from ugr_lightning.analysis.report import ALL_TASKS, Contest, Report
 from ugr_lightning.errors import ConfigError
+from ugr_lightning.rollout.results import wilson_interval
 
 LEVEL = 0.05
 MARGIN = 0.10
@@ -59,8 +61,13 @@ def _differs(contest: Contest) -> bool:
 
 
 def _is_close(contest: Contest) -> bool:
-    """Whether a difference of the margin or more is excluded, by more than the lack of any differing episode."""
-    return max(-contest.low, contest.high) < MARGIN and contest.seeds * MARGIN >= ENOUGH_TRAINING_SEEDS
+    """Whether a difference of the margin or more is excluded."""
+    return _largest(contest) < MARGIN
+
+
+def _largest(contest: Contest) -> float:
+    """The largest difference that is not excluded; never less than where no episode differs, however few there are."""
+    return max(-contest.low, contest.high, wilson_interval(0, contest.seeds)[1])
 
 
 def _verdict(contest: Contest) -> str:
@@ -68,9 +75,9 @@ def _verdict(contest: Contest) -> str:
         won = _from_the_winner(contest)
         return f"`{won.a}` succeeds more often than `{won.b}` {_where(won)}: {_numbers(won)}. {_again(won)}"
     if _is_close(contest):
-        largest = max(-contest.low, contest.high)
+        percent = math.ceil(100 * _largest(contest) - 1e-9)  # rounding down would claim too much
         return (
-            f"`{contest.a}` and `{contest.b}` differ by less than {largest:.0%} {_where(contest)}, and no difference "
+            f"`{contest.a}` and `{contest.b}` differ by less than {percent}% {_where(contest)}, and no difference "
             f"is shown: {_numbers(contest)}."
         )
     return (
@@ -95,7 +102,7 @@ def _where(contest: Contest) -> str:
 
 def described_execution(execution: str) -> str:
     """An execution in words; a name that a benchmark has given stays as it is."""
-    known = {"aggregate": "aggregated chunks", "aggregate-variance": "chunks aggregated by their variance"}
+    known = {"aggregate": "aggregated chunks", "aggregate-variance": "chunks aggregated with inverse variance"}
     return known.get(execution, f"{execution} steps of each chunk" if execution.isdecimal() else execution)
 
 

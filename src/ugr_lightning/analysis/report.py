@@ -12,7 +12,7 @@ from ugr_lightning.analysis.stats import PairedTable, paired_difference_interval
 from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.evaluations import Evaluation
-from ugr_lightning.rollout.results import Summary, summarize
+from ugr_lightning.rollout.results import Summary, summarize, wilson_interval
 
 ALL_TASKS = "all tasks"
 
@@ -22,8 +22,8 @@ class Mode(NamedTuple):
 
     Args:
         setting: scene setting.
-        execution: `aggregate`, or the number of steps executed of each chunk, or the name that a benchmark gives to
-            executions that differ between policies.
+        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), the number of steps executed
+            of each chunk, or the name that a benchmark gives to executions that differ between policies.
     """
 
     setting: str
@@ -64,7 +64,8 @@ class Contest:
         rate_a, rate_b: success rates on what is compared, tasks weighing the same.
         only_a, only_b: episodes in which only one of them succeeds.
         low, high: 95 % interval of rate_a - rate_b.
-        interval: `Newcombe` (one task, one training seed) or `bootstrap` (over training and evaluation seeds).
+        interval: `Newcombe` (one task, one training seed), `bootstrap` (over training and evaluation seeds), or
+            `Wilson` where no episode differs: how many of the seeds could, had there been more of them.
         p_value: exact McNemar test; with several training seeds its generalisation, the sign-flip test by seed.
         p_holm: corrected for all contests of the mode, single tasks and `all tasks` apart.
     """
@@ -229,6 +230,9 @@ def _contest(mode: Mode, tasks: Sequence[str], pair: tuple[str, str], outcomes: 
         interval, (low, high) = "Newcombe", paired_difference_interval(_table(tables_a[0], tables_b[0]))
     else:
         interval, (_, low, high, _) = "bootstrap", hierarchical_bootstrap(tables_a, tables_b)
+    if only_a == only_b == 0 and interval == "bootstrap":  # resampling cannot show what no episode has shown
+        high = wilson_interval(0, len(by_seed))[1]
+        interval, low = "Wilson", -high
     return Contest(
         mode,
         tasks[0] if len(tasks) == 1 else ALL_TASKS,
