@@ -70,12 +70,11 @@ def _path(pattern: str, index: int, key: str = "") -> str:
 
 
 def _rate(episodes: Sequence[Episode], fps: int | None) -> int:
-    said = {episode.extras.get("control_hz") for episode in episodes} if fps is None else {fps}
-    rate = said.pop() if len(said) == 1 else None
-    if rate is None or rate < 1 or rate != int(rate):
-        got = "none" if rate is None and not said else f"{rate if rate is not None else sorted(map(str, said))}"
-        fix = "State it in whole steps per second (`fps`)."
-        raise DataError(episodes[0].path.parent, "episodes that say one rate in whole steps per second", got, fix)
+    said = {episode.extras.get("control_hz") if fps is None else fps for episode in episodes}
+    rate = next(iter(said))
+    if len(said) > 1 or not isinstance(rate, (int, float)) or rate < 1 or rate != int(rate):
+        expected, fix = "episodes that say one rate in whole steps per second", "State it (`fps`)."
+        raise DataError(episodes[0].path.parent, expected, " and ".join(sorted(map(str, said))), fix)
     return int(rate)
 
 
