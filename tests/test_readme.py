@@ -13,7 +13,7 @@ from ugr_lightning.cli import call, main
 from ugr_lightning.models.refine.selector import Selector
 
 ROOT = Path(__file__).parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PACKAGE = ROOT / "src" / "ugr_lightning"
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
