@@ -23,16 +23,19 @@ def _inspect(path: str, picture: str | None = None) -> int:
     """Say what a checkpoint, an episode or a folder is.
 
     Args:
-        path: a `.ckpt` file, an exported folder, an `.hdf5` episode, a folder of demonstrations, or a folder of runs.
-        picture: for an episode, where its contact sheet goes; null means `<episode>.png` in the working folder.
+        path: a `.ckpt` file, an exported folder, a folder of runs, or demonstrations, see `ugr data inspect`.
+        picture: for demonstrations, where the contact sheet goes; null means `<name>.png` in the working folder.
     """
+    from ugr_lightning.cli.data import inspect_data
+    from ugr_lightning.data.formats import recognise
+
     place = Path(path)
     if (place / "model.safetensors").is_file():
         lines = _checkpoint(place)
+    elif recognise(place) or place.suffix in (".hdf5", ".h5"):
+        return inspect_data(path, picture=picture)
     elif place.is_dir():
-        lines = _recording(place) or _runs(place)
-    elif place.suffix == ".hdf5":
-        lines = _episode(place, Path(picture or f"{place.stem}.png"))
+        lines = _runs(place)
     elif place.is_file():
         lines = _checkpoint(place)
     else:
@@ -75,60 +78,6 @@ def _numbers(values: Any) -> str:
     return f"{tuple(array.shape)} {shown}"
 
 
-def _episode(path: Path, picture: Path) -> list[str]:
-    from ugr_lightning.contract import CAMERAS
-    from ugr_lightning.data.formats.robotwin import read_episode
-
-    episode = read_episode(path, CAMERAS)
-    steps = np.linspace(0, episode.length - 1, min(8, episode.length)).astype(int)
-    _contact_sheet([episode.images(int(step)) for step in steps], picture)
-    moved = np.abs(np.diff(episode.action, axis=0)).max(0) if episode.length > 1 else np.zeros(episode.action.shape[1])
-    return [
-        f"{path}: one demonstration, {episode.length} decision steps",
-        f"seed        {episode.seed}",
-        f"cameras     {', '.join(episode.cameras)} at {episode.image_size[0]}x{episode.image_size[1]} (height x width)",
-        f"state       {episode.state.shape} {episode.state.dtype}",
-        f"action      {episode.action.shape} {episode.action.dtype}",
-        f"  lowest    {np.round(episode.action.min(0), 3).tolist()}",
-        f"  highest   {np.round(episode.action.max(0), 3).tolist()}",
-        f"  fastest   {np.round(moved, 3).tolist()} per step",
-        f"pictures    {picture}",
-    ]
-
-
-def _contact_sheet(frames: list[np.ndarray], path: Path) -> None:
-    """Write pictures of some steps, one row per step and one column per camera.
-
-    Args:
-        frames: (V, H, W, 3) uint8 RGB each.
-        path: PNG file.
-    """
-    from PIL import Image
-
-    rows = [np.concatenate(list(frame), axis=1) for frame in frames]  # (H, V W, 3) each
-    path.parent.mkdir(parents=True, exist_ok=True)
-    Image.fromarray(np.concatenate(rows, axis=0)).save(path, format="PNG")
-
-
-def _recording(folder: Path) -> list[str]:
-    from ugr_lightning.contract import CAMERAS
-    from ugr_lightning.data.folder import find_episodes, read_seeds
-    from ugr_lightning.data.formats.robotwin import read_episode
-
-    found = find_episodes(folder)
-    if not found:
-        return []
-    episodes = [read_episode(path, CAMERAS) for path in found.values()]
-    lengths = [episode.length for episode in episodes]
-    seeds = read_seeds(folder)
-    return [
-        f"{folder}: {len(found)} demonstrations, all readable",
-        f"steps       {min(lengths)} to {max(lengths)}, mean {np.mean(lengths):.0f}, {sum(lengths)} in all",
-        f"pictures    {episodes[0].image_size[0]}x{episodes[0].image_size[1]} (height x width)",
-        f"seeds       {_short(seeds) if seeds else 'none recorded'}",
-    ]
-
-
 def _runs(folder: Path) -> list[str]:
     from ugr_lightning.training.checkpoint import read_checkpoint
 
@@ -137,6 +86,7 @@ def _runs(folder: Path) -> list[str]:
         content = read_checkpoint(path)
         lines.append(f"{path}: step {content.get('global_step')}, {path.stat().st_size / 2**20:.1f} MiB")
     if not lines:
-        got = "neither episodes nor checkpoints"
-        raise DataError(folder, "demonstrations or runs", got, "Record with `ugr collect`, or train with `ugr fit`.")
+        from ugr_lightning.data.formats import detect
+
+        detect(folder)  # says which demonstrations would have been known
     return lines

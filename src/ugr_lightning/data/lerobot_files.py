@@ -73,7 +73,7 @@ def _rate(episodes: Sequence[Episode], fps: int | None) -> int:
     said = {episode.extras.get("control_hz") if fps is None else fps for episode in episodes}
     rate = next(iter(said))
     if len(said) > 1 or not isinstance(rate, (int, float)) or rate < 1 or rate != int(rate):
-        expected, fix = "episodes that say one rate in whole steps per second", "State it (`fps`)."
+        expected, fix = "episodes that say one rate in whole steps per second", "State it (`fps`, or `--rate`)."
         raise DataError(episodes[0].path.parent, expected, " and ".join(sorted(map(str, said))), fix)
     return int(rate)
 

@@ -69,6 +69,11 @@ class EpisodeFormat(ABC):
     marks: ClassVar[str]
     """What `recognises` looks for, in words, for the error of `detect`."""
 
+    @property
+    def writable(self) -> bool:
+        """Whether `write` does anything else than refuse."""
+        return type(self).write is not EpisodeFormat.write
+
     @abstractmethod
     def recognises(self, folder: Path) -> bool:
         """Whether the folder holds this format, by content and never by its name; False for anything unreadable."""
@@ -125,6 +130,11 @@ class NumberedFiles(EpisodeFormat):
 
     The files are in the folder itself or in its subfolder `data`; a single file, under any name, is a folder of one.
     """
+
+    @property
+    def writable(self) -> bool:
+        """Whether `fill` does anything else than refuse."""
+        return type(self).fill is not NumberedFiles.fill
 
     @abstractmethod
     def matches(self, file: h5py.File) -> bool:

@@ -48,7 +48,7 @@ def _velocities(episode: Episode) -> np.ndarray:
         return np.asarray(episode.extras["qvel"], np.float32)
     rate = episode.extras.get("control_hz")
     if rate is None:
-        fix = "Convert to `act`, which needs no velocities."
+        fix = "State the steps per second with `--rate`, or convert to `act`, which needs no velocities."
         raise DataError(episode.path, "`control_hz`, to derive joint velocities from", "none", fix)
     joints = episode.state if episode.measured is None else episode.measured  # (T, S)
     return np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(rate)

@@ -1,0 +1,236 @@
+"""`ugr data inspect` and `ugr data convert`: demonstrations of any format that is recognised."""
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ugr_lightning.cli.call import call, name_leading
+from ugr_lightning.contract import CHUNK_LENGTH
+from ugr_lightning.data.layout import Layout
+from ugr_lightning.errors import ConfigError, DataError
+
+if TYPE_CHECKING:
+    from ugr_lightning.data.inspection import Inspection
+
+
+def inspect_data(
+    path: str,
+    cameras: list[str] | None = None,
+    layout: Layout | None = None,
+    episodes: int | None = None,
+    chunk_length: int = CHUNK_LENGTH,
+    picture: str | None = None,
+) -> int:
+    """Say what demonstrations are: format, lengths, cameras, rates, what the actions are, statistics, oddities.
+
+    Every number and every picture is read. Exit code 2 where an episode cannot be read.
+
+    Args:
+        path: a folder or a file of any format that is recognised.
+        cameras: cameras by the names that a policy would use; null for all there are.
+        layout: joints and cameras as a policy would see them; null for everything as it is.
+        episodes: look at so many only; null for all.
+        chunk_length: K of the policy that is to be trained; shorter episodes are listed.
+        picture: where the contact sheet goes; null means `<name>.png` in the working folder.
+    """
+    from ugr_lightning.data.inspection import inspect_demonstrations
+    from ugr_lightning.rollout.progress import Progress
+
+    place = Path(path)
+    if episodes is not None and episodes < 1:
+        raise ConfigError("--episodes", "at least 1", episodes, "Correct the number.")
+    sheet = Path(picture or f"{place.resolve().stem if place.is_file() else place.resolve().name}.png")
+    with ExitStack() as stack:
+        bars: list[Progress] = []
+
+        def done(number: int, total: int) -> None:
+            if not bars:
+                bars.append(stack.enter_context(Progress(f"reading {place.name}", total, shown=total > 1)))
+            bars[0].advance()
+
+        found = inspect_demonstrations(place, cameras=cameras, layout=layout, episodes=episodes, done=done)
+    print("\n".join([*_describe(found, chunk_length), f"pictures    {_contact_sheet(found, sheet)}"]), flush=True)
+    return 2 if found.unreadable else 0
+
+
+def _describe(found: "Inspection", chunk_length: int) -> list[str]:
+    from ugr_lightning.data.oddities import find_oddities, shorten
+
+    seen, first = found.seen, found.seen[0]
+    lengths = [one.episode.length for one in seen]
+    seeds = [one.episode.seed for one in seen if one.episode.seed is not None]
+    said = sorted({str(v) for one in seen for k in ("task", "instruction") if (v := one.episode.extras.get(k))})
+    many = f"{min(lengths)} to {max(lengths)} decision steps, mean {np.mean(lengths):.0f}, {sum(lengths)} in all"
+    complete = "all readable" if not found.unreadable else f"{len(found.unreadable)} of them UNREADABLE"
+    count = len(seen) + len(found.unreadable)
+    of_all = f" of {len(found.present)}" if count < len(found.present) else ""
+    cameras = [f"{camera} {view.size[0]}x{view.size[1]}" for camera, view in first.views.items()]
+    lines = [
+        f"{found.folder}: {found.form.name}, {count}{of_all} demonstrations, {complete}",
+        f"episodes    {shorten([one.index for one in seen])}",
+        f"steps       {many if len(seen) > 1 else f'{lengths[0]} decision steps'}",
+        f"rate        {_rate(found)}",
+        f"cameras     {', '.join(cameras)} (height x width), {_colour_order(found)}",
+        f"measured    {'no' if first.episode.measured is None else 'joints as they were, `data.state: measured`'}",
+        f"seeds       {shorten(seeds) if seeds else 'none recorded'}",
+        *([f"task        {shorten(said, 3)}"] if said else []),
+        f"action      {_alignment(found)}",
+        *_statistics(found),
+    ]
+    unreadable = [f"UNREADABLE  {index}: {error}" for index, error in found.unreadable.items()]
+    oddities = find_oddities(found, chunk_length) or ["none found"]
+    return [*lines, *(f"{'oddities' if i == 0 else '':<12}{line}" for i, line in enumerate(oddities)), *unreadable]
+
+
+def _rate(found: "Inspection") -> str:
+    rates = sorted({one.episode.extras.get("control_hz") for one in found.seen} - {None})
+    frequencies = sorted({one.episode.extras.get("frequency") for one in found.seen} - {None})
+    words = [", ".join(f"{rate:g}" for rate in rates) + " steps per second"] if rates else ["not stated"]
+    if frequencies:
+        words.append(f"`frequency` {', '.join(map(str, frequencies))}: simulation steps between frames, if RoboTwin's")
+    return "; ".join(words)
+
+
+def _colour_order(found: "Inspection") -> str:
+    views = [view for one in found.seen for view in one.views.values()]
+    if views[0].marked is None:
+        return "stored as true RGB"
+    marked = sum(view.marked or 0 for view in views)
+    total = sum(one.episode.length * len(one.views) for one in found.seen)
+    if marked == 0:
+        return "JPEGs with red and blue swapped on disk, as RoboTwin's are"
+    return f"JPEGs, {marked} of {total} marked as true RGB, the others swapped on disk"
+
+
+def _alignment(found: "Inspection") -> str:
+    """What the action of a step is, in words."""
+    from ugr_lightning.data.inspection import measure_alignment
+
+    measured = measure_alignment(found.rows("state"), found.rows("action"))
+    stored = found.seen[0].episode.extras.get("action_alignment")
+    note = f" (the file's rows: {stored})" if stored else ""
+    if measured is None:
+        return f"has other columns than the state: they cannot be compared{note}"
+    if not measured.moving or not measured.distances:
+        return f"cannot be told from the numbers: no joint moves{note}"
+    n = measured.moving
+    for count, words in ((measured.is_next_state, "state[t+1]"), (measured.is_state, "state[t]")):
+        if count == n:
+            return f"action[t] is {words}, in all {n} steps in which a joint moves{note}"
+    best = int(np.argmin(measured.distances))
+    near = ", ".join(f"{d:.4f} to state[t{f'+{k}' if k else ''}]" for k, d in enumerate(measured.distances[:3]))
+    return (
+        f"action[t] is a command of its own: state[t+1] in {measured.is_next_state} and state[t] in "
+        f"{measured.is_state} of {n} steps in which a joint moves; nearest to state[t{f'+{best}' if best else ''}], "
+        f"mean distance {near}{note}"
+    )
+
+
+def _statistics(found: "Inspection") -> list[str]:
+    """A table of all columns of both vectors."""
+    lines = []
+    for vector in ("state", "action"):
+        rows, names = found.rows(vector), found.names(vector)
+        values = np.concatenate(rows).astype(np.float64)  # (N, D)
+        steps = np.concatenate([np.zeros((1, values.shape[1])), *(np.abs(np.diff(one, axis=0)) for one in rows)])
+        table = np.stack([values.min(0), values.max(0), values.mean(0), values.std(0), steps.max(0)], axis=1)  # (D, 5)
+        width = max(16, *(len(name) for name in names))
+        heads = "".join(f"{head:>10}" for head in ("lowest", "highest", "mean", "std", "fastest"))
+        lines.append(f"{vector:<{width}}  {heads}  ({len(names)} columns; fastest: largest change in a step)")
+        lines += [
+            f"  {name:<{width}}{''.join(f'{number:>10.4g}' for number in row)}"
+            for name, row in zip(names, table, strict=True)
+        ]
+    return lines
+
+
+def _contact_sheet(found: "Inspection", path: Path) -> str:
+    """Write a PNG of some steps and say what it shows; rows are steps, columns are cameras.
+
+    Cameras of different sizes are shown at the size of the first.
+    """
+    from PIL import Image
+
+    height, width = next(iter(found.seen[0].views.values())).size
+    rows, said = [], []
+    for one in (one for one in found.seen if one.steps):
+        for pictures in zip(*(view.shown for view in one.views.values()), strict=True):
+            tiles = [Image.fromarray(picture) for picture in pictures]
+            same = [tile if tile.size == (width, height) else tile.resize((width, height)) for tile in tiles]
+            rows.append(np.concatenate([np.asarray(tile) for tile in same], axis=1))  # (H, V W, 3)
+        said.append(f"{one.index}: {', '.join(map(str, one.steps))}")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    try:
+        Image.fromarray(np.concatenate(rows, axis=0)).save(path, format="PNG")
+    except OSError as error:
+        raise DataError(path, "a place for the contact sheet", str(error), "Choose another: `--picture`.") from error
+    return f"{path}: columns {', '.join(found.seen[0].views)}; rows episode: steps {'; '.join(said)}"
+
+
+def convert_data(
+    source: str,
+    target: str,
+    to: str,
+    cameras: list[str] | None = None,
+    layout: Layout | None = None,
+    episodes: int | None = None,
+    rate: float | None = None,
+) -> int:
+    """Write demonstrations of any format that is recognised again in another one; goes on where it was stopped.
+
+    Everything is read and checked first; states and actions are read back and compared to the bit at last.
+
+    Args:
+        source: a folder or a file.
+        target: a folder that is empty, new, or was begun by the same command.
+        to: `robotwin`, `act`, `original-act` or `lerobot`.
+        cameras: cameras to write, by the names that a policy would use; null for all.
+        layout: joints and cameras as a policy would see them; null for everything as it is.
+        episodes: convert so many; null for all.
+        rate: steps per second, where the files do not say it or the target needs another number; null for theirs.
+    """
+    from ugr_lightning.data.conversion import convert, left_out
+    from ugr_lightning.data.formats import find_format
+    from ugr_lightning.rollout.progress import Progress
+
+    for name, number in (("episodes", episodes), ("rate", rate)):
+        if number is not None and not number >= (1 if name == "episodes" else 1e-3):
+            raise ConfigError(f"--{name}", "a number above 0", number, "Correct the number.")
+    with ExitStack() as stack:
+        bars: dict[str, Progress] = {}
+
+        def done(what: str, number: int, total: int) -> None:
+            if what not in bars:
+                stack.close()
+                bars[what] = stack.enter_context(Progress(what, total))
+            bars[what].advance()
+
+        options = {"cameras": cameras, "layout": layout, "episodes": episodes, "rate": rate}
+        found = convert(Path(source), Path(target), to, done=done, **options)  # type: ignore[arg-type]
+    lost = left_out(find_format(to), Path(target), found)
+    steps = sum(episode.length for episode in found)
+    print(f"{target}: {len(found)} episodes, {steps} steps as {to}; states and actions are the same to the bit")
+    print(f"cameras     {', '.join(found[0].cameras)}")
+    print(f"left out    {', '.join(lost) or 'nothing'}")
+    return 0
+
+
+FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
+    "inspect": (inspect_data, ("path",)),
+    "convert": (convert_data, ("source", "target")),
+}
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr data inspect` or `ugr data convert`."""
+    if not argv or argv[0] not in FUNCTIONS:
+        if argv and argv[0] in ("-h", "--help"):
+            print("usage: ugr data inspect PATH\n       ugr data convert FROM TO --to FORMAT\n(`--help` behind each)")
+            return 0
+        got = argv[0] if argv else "nothing"
+        raise ConfigError("ugr data", f"one of {', '.join(FUNCTIONS)}", got, "`ugr data --help` lists them.")
+    function, leading = FUNCTIONS[argv[0]]
+    return call(function, f"{command} {argv[0]}", name_leading(argv[1:], leading))

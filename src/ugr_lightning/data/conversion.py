@@ -1,0 +1,173 @@
+"""Writing demonstrations again in another format: whole episodes only, and a second run goes on with the first."""
+
+import hashlib
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ugr_lightning.data.episode import Episode
+from ugr_lightning.data.folder import publish
+from ugr_lightning.data.formats import EpisodeFormat, detect, find_format, formats
+from ugr_lightning.data.layout import Layout
+from ugr_lightning.errors import ConfigError, DataError
+
+NOTE = "conversion.json"  # in the target: what it is a conversion of
+
+Done = Callable[[str, int, int], None]
+
+
+def convert(
+    source: Path,
+    target: Path,
+    to: str,
+    *,
+    cameras: Sequence[str] | None = None,
+    layout: Layout | None = None,
+    episodes: int | None = None,
+    rate: float | None = None,
+    done: Done = lambda what, number, total: None,
+) -> list[Episode]:
+    """Convert demonstrations; everything is read and checked before anything is written.
+
+    Stopped at any point, the target has whole episodes only, and the same call goes on with the first one missing.
+
+    Args:
+        source: a folder or file of any format that is recognised.
+        target: a folder that is empty, not there yet, or holds what an earlier call with the same arguments wrote.
+        to: name of the format to write.
+        cameras: cameras by the policy's names; null for all there are.
+        layout: joints and cameras as a policy would see them; null for all columns as they are.
+        episodes: convert so many, from the lowest index on; null for all.
+        rate: steps per second; null for what the files say.
+        done: called with `reading`, `writing` or `checking`, the number of episodes that are, and their total.
+
+    Returns:
+        The source's episodes, in the order in which they are numbered in the target.
+
+    Raises:
+        DataError: a damaged episode, one that the format cannot hold, a target with something else in it, a disk that
+            is full, or numbers that did not come back as they were.
+        ConfigError: an unknown format or camera, one that is only read, or a target that is the source.
+    """
+    source, target = Path(source), Path(target)
+    form = find_format(to)
+    if not form.writable:
+        written = ", ".join(one.name for one in formats() if one.writable)
+        raise ConfigError("--to", f"a format that can be written: {written}", to, "Choose another.")
+    _check_target(source, target)
+    found = _read_all(source, cameras, layout, episodes, rate, done)
+    note = _describe(found, source, to)
+    _check_note(target, note)
+    try:
+        publish(target / NOTE, lambda partial: partial.write_text(json.dumps(note, indent=2) + "\n") and None)
+        form.write(target, found, lambda index: done("writing", index + 1, len(found)))
+        _check_written(form, target, found, done)
+    except OSError as error:
+        fix = "Make room, or choose another folder; the same command goes on."
+        raise DataError(target, "a folder that can be written", str(error), fix) from error
+    return found
+
+
+def _check_target(source: Path, target: Path) -> None:
+    """What can be said before the source is read."""
+    if target.exists() and not target.is_dir():
+        raise ConfigError("the target", "a folder", f"the file {target}", "Choose another name.")
+    if target.resolve() == source.resolve():
+        raise ConfigError("the target", "another folder than the source", target, "Choose another name.")
+    if target.is_dir() and not (target / NOTE).is_file():
+        others = sorted(path.name for path in target.iterdir() if path.name != f"{NOTE}.partial")
+        if others:
+            got = ", ".join(others[:6]) + " ..." * (len(others) > 6)
+            raise DataError(
+                target, f"an empty folder, or one with the {NOTE} of this conversion", got, "Choose another."
+            )
+
+
+def _read_all(
+    source: Path,
+    cameras: Sequence[str] | None,
+    layout: Layout | None,
+    episodes: int | None,
+    rate: float | None,
+    done: Done,
+) -> list[Episode]:
+    form = detect(source)
+    locations = list(form.find(source).values())[:episodes]
+    if not locations:
+        raise DataError(source, f"demonstrations of {form.name}", "none", "Check the path.")
+    contents = form.peek(locations[0])
+    found = []
+    for number, location in enumerate(locations, start=1):
+        episode = form.read(location, cameras or contents.cameras, layout or contents.layout)
+        if rate is not None:
+            episode = replace(episode, extras=episode.extras | {"control_hz": float(rate)})
+        found.append(episode)
+        done("reading", number, len(locations))
+    return found
+
+
+def _describe(episodes: Sequence[Episode], source: Path, to: str) -> dict[str, Any]:
+    """What tells one conversion from another; the place of the source does not."""
+    digest = hashlib.sha256()
+    for episode in episodes:
+        for values in (episode.state, episode.action):
+            digest.update(f"{values.shape}".encode() + values.tobytes())
+        sizes = [path.stat().st_size for path in episode.frames.files]
+        digest.update(f"{episode.name} {episode.image_size} {episode.extras.get('control_hz')} {sizes}".encode())
+    return {
+        "from": source.name,
+        "to": to,
+        "cameras": list(episodes[0].cameras),
+        "episodes": [episode.name for episode in episodes],
+        "sha256": digest.hexdigest(),
+    }
+
+
+def _check_note(target: Path, note: dict[str, Any]) -> None:
+    """A conversion that was begun may only be gone on with by itself."""
+    path = target / NOTE
+    if not path.is_file():
+        return
+    try:
+        begun = json.loads(path.read_text())
+        differ = [name for name in note if name != "from" and begun.get(name) != note[name]]
+    except (OSError, ValueError, AttributeError, RecursionError) as error:
+        raise DataError(path, "the note of a conversion", str(error), "Choose an empty folder.") from error
+    if differ:
+        got = f"one with other {' and '.join(differ)}"
+        raise DataError(path, "the conversion that was begun here", got, "Choose an empty folder.")
+
+
+def _check_written(form: EpisodeFormat, target: Path, episodes: Sequence[Episode], done: Done) -> None:
+    """Read everything back: state and action have to be the same to the bit."""
+    locations = form.find(target)
+    if list(locations) != list(range(len(episodes))):
+        raise DataError(target, f"episodes 0 to {len(episodes) - 1}", list(locations)[:8], "Convert again.")
+    for number, (location, given) in enumerate(zip(locations.values(), episodes, strict=True), start=1):
+        layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
+        back = form.read(location, given.cameras, layout)
+        same = np.array_equal(back.state, given.state) and np.array_equal(back.action, given.action)
+        if not same or back.image_size != given.image_size:
+            got = "other numbers, or pictures of another size"
+            raise DataError(back.path, f"what {given.path} has", got, "Remove this file and convert again.")
+        done("checking", number, len(episodes))
+
+
+def left_out(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -> list[str]:
+    """What the source says of an episode and the target has no place for, by name.
+
+    Args:
+        form: the format written.
+        target: the folder written.
+        episodes: as `convert` returns them.
+    """
+    given = episodes[0]
+    layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
+    back = form.read(form.find(target)[0], given.cameras, layout)
+    known = {"seed": given.seed, "measured": given.measured, **given.extras}
+    kept = {"seed": back.seed, "measured": back.measured, **back.extras}
+    return sorted(name for name, value in known.items() if value is not None and kept.get(name) is None)
