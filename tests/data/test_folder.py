@@ -61,6 +61,7 @@ def test_instructions_are_lists_of_seen_and_unseen(tmp_path):
     ("name", "content", "read"),
     [
         ("seed.txt", "1 2 three", read_seeds),
+        ("seed.txt", "1" * 5000, read_seeds),
         ("scene_info.json", "{", read_scene_info),
         ("scene_info.json", "[1]", read_scene_info),
         ("scene_info.json", '{"scene": {}}', read_scene_info),

@@ -11,6 +11,7 @@ import numpy as np
 
 from ugr_lightning.errors import DataError
 
+MAX_DIGITS = 18  # of a seed
 EPISODE_NAME = re.compile(r"episode_?(\d+)\.hdf5")
 
 
@@ -81,7 +82,7 @@ def read_seeds(folder: Path) -> list[int]:
     if not path.is_file():
         return []
     words = path.read_text(errors="replace").split()
-    wrong = [word for word in words if not word.isdecimal()]
+    wrong = [word for word in words if not word.isdecimal() or len(word) > MAX_DIGITS]
     if wrong:
         raise DataError(path, "whole numbers separated by spaces", wrong[0][:40], "Restore or remove the file.")
     return [int(word) for word in words]

@@ -391,6 +391,16 @@ def test_seven_joints_per_arm_are_named_and_picked(tmp_path):
     assert np.array_equal(one_arm.action, vector[1:, 8:])
 
 
+@pytest.mark.parametrize("arm", [1.0, np.zeros((6, 10**4)), np.zeros(6)])
+def test_arms_that_do_not_fit_the_vector_only_cost_the_names(arm, tmp_path):
+    form = detect(_theirs(tmp_path, "episode{i}.hdf5"))
+    location = form.find(tmp_path)[0]
+    with h5py.File(location.path, "r+") as file:
+        _replace("joint_action/left_arm", arm)(file)
+    assert form.peek(location).state == tuple(map(str, range(14)))
+    assert form.read(location, CAMERAS).length == 5
+
+
 def test_a_recording_is_rewritten_in_the_same_bytes_of_pictures_and_numbers(tmp_path, episode_file):
     given = read_episode(episode_file)
     find_format("robotwin").write(tmp_path / "again", [given])

@@ -254,12 +254,15 @@ def read_episode(
 
 def _columns(file: h5py.File, width: int) -> tuple[str, ...]:
     """Names of the columns of `joint_action/vector`: left arm, left gripper, right arm, right gripper."""
+    arms = [f"joint_action/{side}_arm" for side in ("left", "right")]
+    shapes = [find_dataset(file, arm).shape or () if has_key(file, arm) else () for arm in arms]
+    joints = [shape[1] if len(shape) == 2 else 0 for shape in shapes]
+    if sum(joints) + 2 != width:
+        return tuple(map(str, range(width)))
     names: list[str] = []
-    for side in ("left", "right"):
-        arm = f"joint_action/{side}_arm"
-        joints = find_dataset(file, arm).shape[-1] if has_key(file, arm) else 0
-        names += [f"{side}_joint_{joint}" for joint in range(1, joints + 1)] + [f"{side}_gripper"]
-    return tuple(names) if len(names) == width else tuple(map(str, range(width)))
+    for side, count in zip(("left", "right"), joints, strict=True):
+        names += [f"{side}_joint_{joint}" for joint in range(1, count + 1)] + [f"{side}_gripper"]
+    return tuple(names)
 
 
 class RoboTwin(NumberedFiles):
