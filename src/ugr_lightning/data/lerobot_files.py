@@ -268,4 +268,7 @@ def _publish_all(
 
 
 def _write_json(path: Path, content: object) -> None:
-    publish(path, lambda partial: partial.write_text(json.dumps(content, indent=4) + "\n") and None)
+    def write(partial: Path) -> None:
+        partial.write_text(json.dumps(content, indent=4) + "\n")
+
+    publish(path, write)
