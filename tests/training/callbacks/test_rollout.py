@@ -7,10 +7,10 @@ import pytest
 from lightning.pytorch import Callback
 from PIL import Image
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-from tiny import train
+from tiny import TinyPolicy, train
 
 from ugr_lightning.contract import EpisodeResult
-from ugr_lightning.errors import RenderError
+from ugr_lightning.errors import ConfigError, RenderError
 from ugr_lightning.rollout.lockstep import EpisodeTrace
 from ugr_lightning.rollout.runner import Runners
 from ugr_lightning.training.callbacks import rollout
@@ -36,7 +36,9 @@ def world(monkeypatch):
         return results
 
     monkeypatch.setattr(rollout, "run_episodes", run_episodes)
-    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", lambda: None)
+    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", lambda task: None)
+    for name in ("STATE_DIM", "ACTION_DIM"):
+        monkeypatch.setattr(rollout, name, 3)  # as the tiny policy
     return calls
 
 
@@ -85,7 +87,7 @@ def test_rollouts_do_not_change_the_training(tmp_path, world):
     assert losses[0] == losses[1]
 
 
-def no_renderer():
+def no_renderer(task):
     raise RenderError("rendering", "a Vulkan device", "none", "Install mesa-vulkan-drivers.")
 
 
@@ -103,3 +105,14 @@ def test_a_missing_renderer_can_be_an_error(tmp_path, world, monkeypatch):
     callback = RolloutEvaluation(every_n_steps=1, on_missing_renderer="error")
     with pytest.raises(RenderError):
         train(tmp_path / "tiny" / "version_0", callbacks=[callback], max_steps=5)
+
+
+@pytest.mark.parametrize("what", ["joints", "cameras"])
+def test_a_policy_of_another_robot_is_refused_before_the_first_step(what, tmp_path, world, monkeypatch):
+    if what == "joints":
+        monkeypatch.setattr(rollout, "ACTION_DIM", 14)
+    policy = TinyPolicy(cameras=("top" if what == "cameras" else "cam_high",))
+    policy.losses = lambda batch: pytest.fail("trained")
+    with pytest.raises(ConfigError, match=r"robot of click_alarmclock.*rollout\.every_n_steps to 0"):
+        train(tmp_path / "tiny" / "version_0", policy, [RolloutEvaluation(every_n_steps=1)], max_steps=5)
+    assert world == []

@@ -9,7 +9,7 @@ from lightning.pytorch import Callback, LightningModule, Trainer
 from lightning.pytorch.utilities import rank_zero_warn
 from matplotlib.figure import Figure
 
-from ugr_lightning.contract import ChunkPolicy, EpisodeResult
+from ugr_lightning.contract import ACTION_DIM, STATE_DIM, ChunkPolicy, EpisodeResult
 from ugr_lightning.errors import ConfigError, RenderError
 from ugr_lightning.rollout.actors import PolicyActor
 from ugr_lightning.rollout.lockstep import EpisodeTrace
@@ -65,7 +65,11 @@ class RolloutEvaluation(Callback):
         self._simulators.close()
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Find out before the first step whether rollouts will be possible."""
+        """Find out before the first step whether rollouts will be possible.
+
+        Raises:
+            ConfigError: data without a task, or a policy of another robot.
+        """
         if not self.every_n_steps or trainer.fast_dev_run:  # type: ignore[attr-defined]
             self.every_n_steps = 0
             return
@@ -74,8 +78,24 @@ class RolloutEvaluation(Callback):
         if self.task is None:
             fix = "Set rollout.task, or rollout.every_n_steps to 0."
             raise ConfigError("rollout.task", "the task of the data", "data without a task", fix)
+        self._check_robot(pl_module.policy)  # type: ignore[arg-type]
         if trainer.is_global_zero and not self._can_render():
             self.every_n_steps = 0
+
+    def _check_robot(self, policy: ChunkPolicy) -> None:
+        """A policy of another robot's demonstrations would only fail at the first rollout.
+
+        Raises:
+            ConfigError: the task's robot has other joints or cameras than the policy.
+        """
+        from ugr_lightning.sim.outside import task_cameras
+
+        cameras = task_cameras(str(self.task))
+        if (policy.state_dim, policy.action_dim) != (STATE_DIM, ACTION_DIM) or not set(policy.cameras) <= set(cameras):
+            robot = f"state {STATE_DIM}, action {ACTION_DIM}, cameras among {', '.join(cameras)}"
+            got = f"state {policy.state_dim}, action {policy.action_dim}, cameras {', '.join(policy.cameras)}"
+            fix = "Set rollout.every_n_steps to 0 for demonstrations of another robot."
+            raise ConfigError("rollout.task", f"a policy for the robot of {self.task} ({robot})", got, fix)
 
     def _can_render(self) -> bool:
         try:
