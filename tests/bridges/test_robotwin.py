@@ -120,11 +120,15 @@ def test_cameras_are_found_by_name_in_whatever_order_the_policy_wants_them(tmp_p
     model = robotwin.get_model(settings(save(Reacher(cameras=cameras), tmp_path / "a.ckpt")))
     seen = model.deployment.see(encoded["images"], encoded["state"])
     assert model.deployment.cameras == {"cam_left_wrist": "left_camera", "cam_high": "head_camera"}
-    assert np.array_equal(seen.images[0], encoded["images"]["head_camera"])
-    assert np.array_equal(seen.images[2], encoded["images"]["left_camera"])
+    assert np.array_equal(seen.images[0], encoded["images"]["left_camera"])
+    assert np.array_equal(seen.images[1], encoded["images"]["head_camera"])
     renamed = robotwin.get_model(settings(tmp_path / "a.ckpt", cameras={"cam_high": "front_camera"}))
     seen = renamed.deployment.see(encoded["images"], encoded["state"])
-    assert np.array_equal(seen.images[0], encoded["images"]["front_camera"])
+    assert np.array_equal(seen.images[1], encoded["images"]["front_camera"])
+    overhead = save(Reacher(cameras=("overhead",)), tmp_path / "b.ckpt")
+    assert robotwin.get_model(settings(overhead, cameras={"overhead": "head_camera"}))
+    with pytest.raises(ConfigError, match="overhead"):
+        robotwin.get_model(settings(overhead))
 
 
 def test_strings_where_switches_and_numbers_are_meant_are_understood(reacher):

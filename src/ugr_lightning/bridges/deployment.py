@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ugr_lightning.contract import CAMERAS, ChunkPolicy
+from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.refine.budget import with_refine_ratio
@@ -23,7 +23,7 @@ class Seen(NamedTuple):
     """An observation as a `PolicyActor` reads it.
 
     Args:
-        images: (3, H, W, 3) uint8 RGB, in the order of `CAMERAS`; (0, H, W, 3) where nobody looks.
+        images: (V, H, W, 3) uint8 RGB, in the order of the policy's cameras; (0, H, W, 3) where nobody looks.
         commanded: (S,) float32, robot units.
         measured: (S,) float32; the outside says only one of the two.
     """
@@ -74,7 +74,7 @@ class Deployment:
         if refine_ratio is not None:
             policy = with_refine_ratio(policy, refine_ratio)
         policy = policy.to(_device(device)).for_inference()
-        self._actor = PolicyActor(policy, name=type(policy).__name__)
+        self._actor = PolicyActor(policy, cameras=policy.cameras, refine_ratio=refine_ratio)
         self._actor.begin(slots, policy.chunk_length if execution == WHOLE_CHUNKS else execution)
         self._begins = set(range(slots))
 
@@ -107,12 +107,12 @@ class Deployment:
         if not np.isfinite(joints).all():
             raise ProtocolError("joints", "finite numbers", "a NaN or an infinity", "Look at the environment.")
         joints = joints.astype(np.float32)
-        images = np.zeros((len(CAMERAS), *self.image_size, 3), np.uint8)
-        for camera, name in self.cameras.items():
+        images = np.empty((len(self.cameras), *self.image_size, 3), np.uint8)  # (V, H, W, 3)
+        for image, (camera, name) in zip(images, self.cameras.items(), strict=True):
             if name not in pictures:
                 fix = "Say with `cameras` what the environment calls it."
                 raise ProtocolError(f"camera {camera}", f"a picture `{name}`", sorted(map(str, pictures)), fix)
-            images[CAMERAS.index(camera)] = scaled(pictures[name], self.image_size, name)
+            image[:] = scaled(pictures[name], self.image_size, name)
         return Seen(images, joints, joints)
 
     def act(self, seen: Mapping[int, Seen]) -> dict[int, np.ndarray]:

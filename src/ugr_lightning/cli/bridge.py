@@ -109,13 +109,11 @@ FUNCTIONS: dict[str, Callable[..., int]] = {"robotwin": _robotwin, "xpolicylab":
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr bridge NAME`."""
+    if argv and argv[0] in ("-h", "--help"):
+        about = [f"  {name:<12}{(part.__doc__ or '').splitlines()[0]}" for name, part in FUNCTIONS.items()]
+        print("\n".join(["usage: ugr bridge NAME [options]; `ugr bridge NAME --help` lists them.", *about]))
+        raise SystemExit(0)
     if not argv or argv[0] not in FUNCTIONS:
-        names = "\n".join(
-            f"  ugr bridge {name:<12}{(part.__doc__ or '').splitlines()[0]}" for name, part in FUNCTIONS.items()
-        )
-        if argv and argv[0] in ("-h", "--help"):
-            print(f"Let a checkpoint be evaluated by other projects.\n{names}")
-            return 0
         got = argv[0] if argv else "nothing"
-        raise ConfigError("ugr bridge", f"one of {', '.join(FUNCTIONS)}", got, "`ugr bridge --help` lists them.")
+        raise ConfigError("ugr bridge", f"one of {', '.join(FUNCTIONS)}", got, "`ugr bridge --help` explains them.")
     return call(FUNCTIONS[argv[0]], f"{command} {argv[0]}", argv[1:])

@@ -171,9 +171,8 @@ class PolicyServer:
 
 def _refusal(content: Mapping[str, Any], error: ProtocolError) -> Frame:
     """The answer to a frame that is none, under whatever name can be made out."""
-    names = {key: content.get(key) for key in ("message_id", "evaluation_id")}
-    plain = {key: value[:256] if isinstance(value, str) else "" for key, value in names.items()}
-    return _error(Frame("", **plain), INVALID_FRAME, str(error))
+    name, evaluation = (str(content.get(field) or "")[:256] for field in ("message_id", "evaluation_id"))
+    return _error(Frame("", name, evaluation), INVALID_FRAME, str(error))
 
 
 def _error(frame: Frame, code: str, message: str) -> Frame:
