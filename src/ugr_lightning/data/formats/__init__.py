@@ -6,7 +6,7 @@ import pkgutil
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import ClassVar
 
@@ -163,7 +163,7 @@ class NumberedFiles(EpisodeFormat):
         for index, episode in enumerate(episodes):
             path = self.episode_file(Path(folder), index)
             if not path.exists():
-                publish(path, lambda partial, episode=episode: self._write_file(partial, episode))
+                publish(path, partial(self._write_file, episode=episode))
                 episode.frames.close()
             done(index)
 

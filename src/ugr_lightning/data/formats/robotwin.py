@@ -255,7 +255,7 @@ def read_episode(
 def _columns(file: h5py.File, width: int) -> tuple[str, ...]:
     """Names of the columns of `joint_action/vector`: left arm, left gripper, right arm, right gripper."""
     arms = [f"joint_action/{side}_arm" for side in ("left", "right")]
-    shapes = [find_dataset(file, arm).shape or () if has_key(file, arm) else () for arm in arms]
+    shapes: list[tuple[int, ...]] = [find_dataset(file, arm).shape or () if has_key(file, arm) else () for arm in arms]
     joints = [shape[1] if len(shape) == 2 else 0 for shape in shapes]
     if sum(joints) + 2 != width:
         return tuple(map(str, range(width)))
