@@ -84,7 +84,7 @@ class Normalizer(nn.Module):
         return action.float() * self.action_scale + self.action_shift
 
     def _require_fit(self) -> None:
-        if not self.fitted:
+        if not torch.compiler.is_exporting() and not self.fitted:
             fix = "Call `set_statistics` with those of the training episodes, or load a checkpoint that has them."
             raise CheckpointError("normalisation statistics", "fitted ones", "none", fix)
 

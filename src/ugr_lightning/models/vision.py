@@ -189,7 +189,7 @@ class ResNet18(nn.Module):
         Raises:
             ConfigError: frozen normalisation without trained weights.
         """
-        if self.norm == "frozen" and not self.pretrained:
+        if self.norm == "frozen" and not torch.compiler.is_exporting() and not self.pretrained:
             fix = "Give `backbone_weights` a ResNet-18 file, or train from scratch with `backbone_norm: batch`."
             raise ConfigError("backbone_norm: frozen", "trained weights", "random ones", fix)
         x = functional.relu(convolve(x, self.conv1, self.bn1), inplace=True)  # (n, width, H/2 or H/4, ...)

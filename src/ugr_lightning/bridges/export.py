@@ -1,0 +1,240 @@
+"""Policies of ours for other programs: written aside, read back, compared, and only then put in place."""
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import torch
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ugr_lightning.bridges.act_checkpoint import EXTRA, export_act, import_act
+from ugr_lightning.bridges.act_statistics import read_act_statistics, write_act_statistics
+from ugr_lightning.bridges.graph import Graph, export_graph, export_onnx, in_fp32, load_graph, load_onnx
+from ugr_lightning.bridges.lerobot import import_lerobot
+from ugr_lightning.bridges.lerobot_folder import export_lerobot
+from ugr_lightning.bridges.model_card import model_card
+from ugr_lightning.contract import ChunkPolicy, EpisodeResult, Observation
+from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.models.act import ACT
+from ugr_lightning.rollout.results import read_results
+from ugr_lightning.training.checkpoint import PolicyInfo, load_policy, read_checkpoint
+from ugr_lightning.training.policy_folder import (
+    CONFIG,
+    WEIGHTS,
+    read_json,
+    read_policy_folder,
+    read_safetensors,
+    write_policy_folder,
+)
+
+Target = Literal["act", "lerobot", "safetensors", "onnx", "torch"]
+TOLERANCE: dict[Target, float] = {"act": 1e-5, "lerobot": 1e-5, "safetensors": 0.0, "onnx": 1e-4, "torch": 1e-4}
+"""Largest difference of actions that is accepted, in robot units, and relative to values above 1."""
+
+
+class Exported(NamedTuple):
+    """What an export did.
+
+    Args:
+        files: names of the files in the folder.
+        difference: largest difference between the actions of the policy and of what was written and read back, in
+            robot units.
+        notes: sentences about what was made up or left behind.
+    """
+
+    files: list[str]
+    difference: float
+    notes: list[str]
+
+
+class _Job(NamedTuple):
+    policy: ChunkPolicy
+    info: PolicyInfo
+    content: dict[str, Any]
+    observation: Observation
+    image_size: tuple[int, int]
+    drop_refinement: bool
+
+
+def export_policy(
+    checkpoint: Path,
+    to: Target,
+    out: Path,
+    *,
+    drop_refinement: bool = False,
+    image_size: tuple[int, int] | None = None,
+    licence: str = "apache-2.0",
+) -> Exported:
+    """Write a policy for another program and check that what it will read gives the same actions.
+
+    Args:
+        checkpoint: file from `ugr fit` or an import, or a folder of safetensors.
+        to: `act` for the original ACT code, `lerobot`, `safetensors` for this package and for tools that read such
+            files, `onnx` or `torch` for the inference graph.
+        out: folder that does not exist yet, or is empty.
+        drop_refinement: leave a refinement branch behind where the target has no place for one.
+        image_size: H and W of the images; None takes the checkpoint's.
+        licence: of the weights, for the model card.
+
+    Raises:
+        ConfigError: the target cannot express the policy, or the folder is taken.
+        CheckpointError: the checkpoint is not usable, or what was read back differs.
+    """
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise ConfigError("--out", "a folder that does not exist yet, or is empty", out, "Choose another folder.")
+    policy, info = load_policy(checkpoint)
+    content = read_policy_folder(checkpoint) if checkpoint.is_dir() else read_checkpoint(checkpoint)
+    size = image_size or info.data.get("image_size")
+    if size is None:
+        fix = "Give the images' height and width, e.g. `--image_size [480,640]`."
+        raise ConfigError("--image_size", "a size, since the checkpoint names none", None, fix)
+    height, width = size
+    observation = made_up_observation(policy, (height, width))
+    job = _Job(policy, info, content, observation, (height, width), drop_refinement)
+    partial = out.with_name(out.name + ".partial")
+    shutil.rmtree(partial, ignore_errors=True)
+    try:
+        partial.mkdir(parents=True)
+        graph, notes = _WRITERS[to](job, partial)
+        difference = _compare(graph, job, to)
+        card = model_card(
+            policy,
+            info,
+            name=out.resolve().name,
+            use=_USE[to].format(out=out.name),
+            results=_results(checkpoint, info),
+            licence=licence,
+            notes=notes,
+        )
+        (partial / "README.md").write_text(card, encoding="utf-8")
+        files = sorted(path.name for path in partial.iterdir())
+        os.replace(partial, out)
+    except OSError as error:
+        raise CheckpointError(
+            out, "a folder that can be written", error, "Free some space, or choose another."
+        ) from error
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+    return Exported(files, difference, notes)
+
+
+def made_up_observation(policy: ChunkPolicy, image_size: tuple[int, int], samples: int = 3) -> Observation:
+    """Noise that a policy can look at: always the same, states spread as in its training.
+
+    Args:
+        policy: with its normalisation statistics.
+        image_size: H and W.
+        samples: B.
+    """
+    draw = torch.Generator().manual_seed(0)
+    time = (policy.observation_steps,) if policy.observation_steps > 1 else ()
+    shape = (samples, *time, len(policy.cameras), 3, *image_size)
+    images = torch.randint(256, shape, dtype=torch.uint8, generator=draw)  # (B, [T,] V, 3, H, W)
+    state = torch.randn(samples, *time, policy.state_dim, generator=draw)  # (B, [T,] S)
+    normalizer: Any = getattr(policy, "normalizer", None)
+    if normalizer is not None:
+        state = normalizer.state_shift + state * normalizer.state_scale
+    return Observation(images, state)
+
+
+def _compare(graph: Graph, job: _Job, to: Target) -> float:
+    """The largest difference of actions; an error if it is too large. Asked with all samples, then with one."""
+    policy = job.policy if to == "safetensors" else in_fp32(job.policy)
+    worst = 0.0
+    for rows in (slice(None), slice(0, 1)):
+        images, state = job.observation.images[rows], job.observation.state[rows]
+        chunk = policy.predict(Observation(images, state))
+        plain = to in ("act", "lerobot") and chunk.coarse is not None
+        wanted = chunk.coarse if plain and chunk.coarse is not None else chunk.actions  # (B, K, A)
+        got = graph(images, state)  # (B, K, A)
+        worst = max(worst, float((got - wanted).abs().max()))
+        if not torch.allclose(got, wanted, rtol=TOLERANCE[to], atol=TOLERANCE[to]):
+            fix = "Nothing was written. Please report it with the checkpoint's `ugr inspect`."
+            raise CheckpointError(f"--to {to}", f"the same actions to {TOLERANCE[to]:g}", f"{worst:g} apart", fix)
+    return worst
+
+
+def _results(checkpoint: Path, info: PolicyInfo) -> list[EpisodeResult]:
+    path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / "evaluation.jsonl"
+    return [one for one in read_results(path) if one.checkpoint == info.sha256] if path.is_file() else []
+
+
+def _act(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
+    policy = _require_act(job, "act")
+    made = export_act(policy, job.content.get(EXTRA), drop_refinement=job.drop_refinement)
+    torch.save(made.weights, folder / "policy_best.ckpt")
+    (folder / "dataset_stats.pkl").write_bytes(write_act_statistics(made.statistics))
+    content = read_checkpoint(folder / "policy_best.ckpt")
+    statistics = read_act_statistics(folder / "dataset_stats.pkl")
+    heads = policy.blueprint()["init_args"]["heads"]
+    again, _ = import_act(content, statistics, cameras=policy.cameras, heads=heads)
+    return _asked(again), made.notes
+
+
+def _lerobot(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
+    made = export_lerobot(_require_act(job, "lerobot"), job.image_size, drop_refinement=job.drop_refinement)
+    for name, content in made.objects.items():
+        (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    for name, tensors in made.tensors.items():
+        save_file(tensors, folder / name, {"format": "pt"})
+    again, _ = import_lerobot(read_json(folder / CONFIG), read_safetensors(folder / WEIGHTS), folder)
+    return _asked(again), made.notes
+
+
+def _safetensors(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
+    about = {"policy": job.info.description, "global_step": job.info.step, "epoch": job.info.epoch}
+    write_policy_folder(folder, job.policy.state_dict(), about)
+    return _asked(load_policy(folder)[0]), []
+
+
+def _onnx(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
+    export_onnx(job.policy, job.observation, folder / "policy.onnx")
+    return load_onnx(folder / "policy.onnx"), _of_graph(job)
+
+
+def _torch(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
+    export_graph(job.policy, job.observation, folder / "policy.pt2")
+    return load_graph(folder / "policy.pt2"), _of_graph(job)
+
+
+def _of_graph(job: _Job) -> list[str]:
+    height, width = job.image_size
+    return [
+        f"the graph takes images of {height} x {width} (height x width), any number of samples, and computes in fp32"
+    ]
+
+
+def _require_act(job: _Job, to: Target) -> ACT:
+    if not isinstance(job.policy, ACT):
+        got = type(job.policy).__name__
+        raise ConfigError(f"--to {to}", "an ACT policy", got, "`--to safetensors` takes any policy.")
+    return job.policy
+
+
+def _asked(policy: ChunkPolicy) -> Graph:
+    def ask(images: Tensor, state: Tensor) -> Tensor:
+        return policy.predict(Observation(images, state)).actions
+
+    return ask
+
+
+_WRITERS: dict[Target, Callable[[_Job, Path], tuple[Graph, list[str]]]] = {
+    "act": _act,
+    "lerobot": _lerobot,
+    "safetensors": _safetensors,
+    "onnx": _onnx,
+    "torch": _torch,
+}
+_USE: dict[Target, str] = {
+    "act": "Put `policy_best.ckpt` and `dataset_stats.pkl` where the original code keeps its checkpoints.",
+    "lerobot": "lerobot-eval --policy.path={out} --env.type=...",
+    "safetensors": "ugr test --ckpt_path {out}",
+    "onnx": "session = onnxruntime.InferenceSession('{out}/policy.onnx')\n"
+    "actions = session.run(['actions'], {{'images': images, 'state': state}})[0]",
+    "torch": 'actions = torch.export.load("{out}/policy.pt2").module()(images, state)',
+}
+assert set(_WRITERS) == set(_USE) == set(TOLERANCE) == set(get_args(Target))
