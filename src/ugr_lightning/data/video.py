@@ -15,7 +15,6 @@ FIX = "Copy the dataset again, or leave this episode out."
 ENCODING = {"preset": "veryfast", "crf": "18", "g": "2", "bf": "0"}
 """H.264 that shows no loss to the eye; every second frame can be jumped to."""
 AHEAD = 8  # frames that are decoded rather than jumped over
-BACK = (0.0, 1.0, 10.0, float("inf"))  # s before the wanted time, until a frame before it is found
 
 
 def import_av() -> Any:
@@ -125,25 +124,18 @@ class _Decoder:
         unit = float(self.stream.time_base)
         wanted, margin = time / unit, tolerance / unit  # in ticks of the stream, as `pts` is
         if self.last is None or not -margin <= wanted - self.last.pts <= 4 * AHEAD * margin:
-            self._jump(wanted, margin, unit)
+            self._jump(wanted)
         while self.last.pts < wanted - margin:
             self.last = self._next()
         if self.last.pts > wanted + margin:
             raise ValueError(f"nothing at {time:.4f} s, the next at {self.last.pts * unit:.4f} s")
         return self.convert.reformat(self.last, format="rgb24").to_ndarray()
 
-    def _jump(self, wanted: float, margin: float, unit: float) -> None:
-        """Go to a key frame that is shown no later than wanted.
-
-        Frames are stored in the order of decoding: the key frame found may be shown later than one before it.
-        """
-        for back in BACK:
-            ticks = max(0, round(wanted - back / unit)) if np.isfinite(back) else 0
-            self.container.seek(ticks, stream=self.stream, backward=True)
-            self.coming = self.container.decode(self.stream)
-            self.last = self._next()
-            if self.last.pts <= wanted + margin:
-                return
+    def _jump(self, wanted: float) -> None:
+        """Go to the last key frame that is shown no later than wanted."""
+        self.container.seek(max(0, round(wanted)), stream=self.stream, backward=True)
+        self.coming = self.container.decode(self.stream)
+        self.last = self._next()
 
     def _next(self) -> Any:
         return next(frame for frame in self.coming if frame.pts is not None)
