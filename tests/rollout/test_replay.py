@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from fake_simulator import STEPS, FakeSimulator
 
+from ugr_lightning.data.executed import read_executed
 from ugr_lightning.data.folder import episode_path
-from ugr_lightning.data.formats.robotwin import read_episode, read_executed
+from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.collect import collect
 from ugr_lightning.rollout.replay import Replayer, replay

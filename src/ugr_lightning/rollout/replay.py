@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ugr_lightning.data.formats.robotwin import Executed, read_executed
+from ugr_lightning.data.executed import Executed, read_executed
 from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.progress import Progress
 from ugr_lightning.rollout.spread import spread

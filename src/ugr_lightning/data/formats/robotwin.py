@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import h5py
 import numpy as np
@@ -29,14 +29,14 @@ from ugr_lightning.data.hdf5 import (
     read_attribute,
     read_strings,
 )
-from ugr_lightning.data.jpeg import encode_frame, jpeg_size
+from ugr_lightning.data.jpeg import encode_frame
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout, policy_cameras
+from ugr_lightning.data.recording import CameraParameters, camera_arrays, checked_array, encoded_frames
 from ugr_lightning.errors import DataError
 
 FORMAT_VERSION = 1
 VECTOR = "joint_action/vector"
 DISK_CAMERAS = {"cam_high": "head_camera", "cam_right_wrist": "right_camera", "cam_left_wrist": "left_camera"}
-CAMERA_PARAMETERS = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
 
 _ATTRIBUTES: dict[str, type] = {
     "seed": int,
@@ -46,8 +46,6 @@ _ATTRIBUTES: dict[str, type] = {
     "setting": str,
     "noise": str,
 }
-
-CameraParameters = Mapping[str, Mapping[str, np.ndarray]]
 
 
 def write_episode(
@@ -104,18 +102,18 @@ def write_episode(
     path, steps = Path(path), len(expert_action)
     if steps < 1:
         raise DataError(path, "at least one step", "none", "Record a longer episode.")
-    commanded = _checked(path, "commanded", commanded, (steps + 1, STATE_DIM))
-    endpose = _checked(path, "endpose", endpose, (steps + 1, 2, 7))
+    commanded = checked_array(path, "commanded", commanded, (steps + 1, STATE_DIM))
+    endpose = checked_array(path, "endpose", endpose, (steps + 1, 2, 7))
     ours = {
-        "expert_action": _checked(path, "expert_action", expert_action, (steps, ACTION_DIM)).astype(np.float32),
-        "measured": _checked(path, "measured", measured, (steps + 1, STATE_DIM)).astype(np.float32),
-        "contacts": _checked(path, "contacts", contacts, (steps + 1, 2)).astype(bool),
-        "slack": _checked(path, "slack", slack, (steps,)).astype(np.float32),
+        "expert_action": checked_array(path, "expert_action", expert_action, (steps, ACTION_DIM)).astype(np.float32),
+        "measured": checked_array(path, "measured", measured, (steps + 1, STATE_DIM)).astype(np.float32),
+        "contacts": checked_array(path, "contacts", contacts, (steps + 1, 2)).astype(bool),
+        "slack": checked_array(path, "slack", slack, (steps,)).astype(np.float32),
     }
     if len(phase) != steps:
         raise DataError(f"{path}:phase", f"{steps} names", len(phase), "Give one phase per step.")
-    jpegs = _encoded(path, images, steps + 1, cameras)
-    parameters = _camera_arrays(path, camera_parameters, steps + 1, cameras)
+    jpegs = encoded_frames(path, images, steps + 1, cameras)
+    parameters = camera_arrays(path, camera_parameters, steps + 1, cameras)
 
     def fill(file: h5py.File) -> None:
         file.attrs["ugr_format_version"] = FORMAT_VERSION
@@ -149,56 +147,6 @@ def _write_robot(file: h5py.File, commanded: np.ndarray, endpose: np.ndarray) ->
     for pose, side in enumerate(("left", "right")):
         file[f"endpose/{side}_endpose"] = endpose[:, pose]
         file[f"endpose/{side}_gripper"] = file[f"joint_action/{side}_gripper"][()]
-
-
-def _checked(path: Path, key: str, values: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.shape != shape:
-        raise DataError(f"{path}:{key}", f"shape {shape}", array.shape, "Nothing was written.")
-    if not np.isfinite(array).all():
-        first = np.argwhere(~np.isfinite(array))[0].tolist()
-        raise DataError(f"{path}:{key}", "finite numbers", f"{array[tuple(first)]} at {first}", "Nothing was written.")
-    return array
-
-
-def _encoded(
-    path: Path, images: np.ndarray | Sequence[Sequence[bytes]], frames: int, cameras: Sequence[str]
-) -> dict[str, list[bytes]]:
-    """JPEG bytes by camera, one per frame."""
-    wanted = f"{frames} frames of {len(cameras)} uint8 pictures (H, W, 3) or JPEGs"
-    if len(images) != frames or any(len(frame) != len(cameras) for frame in images):
-        raise DataError(f"{path}:images", wanted, f"{len(images)} frames", "Nothing was written.")
-    if isinstance(images, np.ndarray):
-        if images.dtype != np.uint8 or images.ndim != 5 or images.shape[-1] != 3:
-            raise DataError(f"{path}:images", wanted, f"{images.shape} {images.dtype}", "Nothing was written.")
-        images = [encode_frame(frame) for frame in images]
-    for step, frame in enumerate(images):
-        for data in frame:
-            try:
-                jpeg_size(bytes(data))
-            except ValueError as error:
-                raise DataError(f"{path}:images[{step}]", "JPEGs", str(error), "Nothing was written.") from error
-    return {camera: [bytes(frame[v]) for frame in images] for v, camera in enumerate(cameras)}
-
-
-def _camera_arrays(
-    path: Path, parameters: CameraParameters | Sequence[CameraParameters], frames: int, cameras: Sequence[str]
-) -> dict[str, dict[str, np.ndarray]]:
-    """By camera and name, an array with one matrix per frame."""
-    rows = [parameters] * frames if isinstance(parameters, Mapping) else list(parameters)
-    if len(rows) != frames:
-        raise DataError(f"{path}:camera_parameters", f"{frames} items", len(rows), "Nothing was written.")
-    arrays: dict[str, dict[str, np.ndarray]] = {}
-    for camera in cameras:
-        arrays[camera] = {}
-        for name, shape in CAMERA_PARAMETERS.items():
-            try:
-                values = np.stack([np.asarray(row[camera][name]) for row in rows])
-            except KeyError as error:
-                got = f"no {error}"
-                raise DataError(f"{path}:{camera}", f"'{name}'", got, "Nothing was written.") from error
-            arrays[camera][name] = _checked(path, f"{camera}/{name}", values, (frames, *shape)).astype(np.float32)
-    return arrays
 
 
 def read_episode(
@@ -325,46 +273,6 @@ def _write_joints(file: h5py.File, vector: np.ndarray) -> None:
         file[f"joint_action/{side}_arm"] = vector[:, start : start + half - 1]
         file[f"joint_action/{side}_gripper"] = vector[:, start + half - 1]
     file[VECTOR] = vector
-
-
-class Executed(NamedTuple):
-    """What a robot was told and did in a recorded episode of N steps.
-
-    Args:
-        path: the file.
-        task, setting, seed: which episode.
-        task_version: None in files that do not say.
-        actions: (N, 14) float32, the commands that were executed, noise included.
-        measured: (N + 1, 14) float32, the joints at reset and after every step.
-    """
-
-    path: Path
-    task: str
-    setting: str
-    seed: int
-    task_version: int | None
-    actions: np.ndarray
-    measured: np.ndarray
-
-
-def read_executed(path: Path) -> Executed:
-    """Read what it takes to execute a recording again.
-
-    Raises:
-        DataError: the file is damaged, or does not say its task, setting and seed, as RoboTwin's own do not.
-    """
-    path = Path(path)
-    with open_hdf5(path) as file:
-        vector = read_array(file, VECTOR, (None, None))
-        about = _read_extras(file, len(vector))
-        missing = [name for name in ("task", "setting", "seed") if name not in about]
-        if missing or not has_key(file, "ugr/measured"):
-            got = f"no {', '.join(missing) or 'measured joints'}"
-            fix = "Only recordings of `ugr collect` can be replayed."
-            raise DataError(path, "a recording that names its task, setting and seed", got, fix)
-        measured = read_array(file, "ugr/measured", vector.shape)
-    version_of_task = about.get("task_version")
-    return Executed(path, about["task"], about["setting"], about["seed"], version_of_task, vector[1:], measured)
 
 
 def _read_extras(file: h5py.File, frames: int) -> dict[str, Any]:
