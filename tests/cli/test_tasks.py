@@ -5,7 +5,7 @@ import pytest
 from ugr_lightning.cli.main import main
 from ugr_lightning.rollout.verify import Verification
 from ugr_lightning.sim.settings import SETTINGS
-from ugr_lightning.sim.tasks import task_names
+from ugr_lightning.sim.tasks import all_task_names, task_names
 
 
 @pytest.fixture
@@ -32,7 +32,7 @@ def calls(monkeypatch):
 
 def test_tasks_are_listed_all_or_one(capsys):
     assert main(["tasks"]) == 0
-    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(task_names())
+    assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(all_task_names())
     assert main(["tasks", "--task", "handover_block"]) == 0
     assert capsys.readouterr().out.startswith("handover_block ")
 

@@ -40,6 +40,12 @@ def test_a_policy_is_judged_seed_by_seed(runner, execution):
     assert first.seeds_hash == seeds_hash(SEEDS)
     assert first.log_variance == {"mean": -3.0, "max": -1.0}
     assert set(first.seconds) == {"query", "simulate"}
+    assert first.refine_ratio is None
+
+
+def test_results_carry_the_budget_that_was_chosen(runner):
+    (result,) = runner.run(PolicyActor(Reacher(), refine_ratio=0.2), [1], progress=False)
+    assert result.refine_ratio == 0.2
 
 
 def test_the_dummies_run_through_the_same_runner(runner):
@@ -149,6 +155,12 @@ def test_cameras_are_found_by_name(runner):
 def test_an_unknown_camera_is_refused_by_name():
     with pytest.raises(CheckpointError, match="cam_front"):
         PolicyActor(Reacher(cameras=("cam_high", "cam_front")))
+
+
+def test_a_simulator_with_cameras_of_its_own_decides_which_are_known():
+    assert PolicyActor(Reacher(cameras=("top",)), cameras=("side", "top"))._views == [1]
+    with pytest.raises(CheckpointError, match="cameras among top, got cam_high"):
+        PolicyActor(Reacher(cameras=("cam_high",)), cameras=("top",))
 
 
 @pytest.mark.parametrize("state", ["commanded", "measured"])

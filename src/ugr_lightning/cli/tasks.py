@@ -27,7 +27,7 @@ def _tasks(
     """List the simulated tasks, measure them, verify that they are deterministic, or picture them.
 
     Args:
-        task: a name, or `all`.
+        task: a name, or `all`: all of ours; outside ones are listed after them.
         setting: `demo_clean`, `demo_randomized`, or `all`.
         measure: `NAME` measures success, length and cost on seeds from 400000 and writes NAME.md and NAME.json; rows
             that are there from before stay, unless they are measured again.
@@ -39,13 +39,16 @@ def _tasks(
         recordings: episodes recorded at each picture size when measuring; 0 needs no renderer.
         workers: simulator processes.
     """
+    from ugr_lightning.sim.outside import outside_names
+    from ugr_lightning.sim.outside_simulator import SETTING
     from ugr_lightning.sim.settings import SETTINGS, check_setting
     from ugr_lightning.sim.tasks import named_tasks, task_summaries
 
     tasks = named_tasks(task)
     if setting != "all":
         check_setting(setting)
-    settings = tuple(SETTINGS) if setting == "all" else (setting,)
+    every = (SETTING,) if task in outside_names() else tuple(SETTINGS)
+    settings = every if setting == "all" else (setting,)
     if (episodes is not None and episodes < 1) or dummy_episodes < 0 or recordings < 0 or workers < 1:
         got = f"{episodes} episodes, {dummy_episodes} of the dummies, {recordings} recordings, {workers} workers"
         raise ConfigError("ugr tasks", "positive numbers", got, "Correct the number.")
@@ -62,7 +65,7 @@ def _tasks(
     if verify:
         return _verify(tasks, settings, episodes or 50, workers)
     if gallery is None and measure is None:
-        for name in tasks:
+        for name in (*tasks, *(outside_names() if task == "all" else ())):
             print(f"{name:<20}{task_summaries()[name]}")
     return 0
 

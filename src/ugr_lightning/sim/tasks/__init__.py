@@ -90,10 +90,12 @@ def load_task(name: str) -> type[Any]:
         name: a name from `task_names`.
 
     Raises:
-        ConfigError: there is no such task.
+        ConfigError: there is no such task, or it is an outside one.
         SimulationError: SAPIEN or ManiSkill is not installed, or the file defines no task.
     """
     check_task(name)
+    if name in outside_names():
+        raise ConfigError("task", "one of our own", name, "`sim.outside.simulator_of` opens it.")
     try:
         from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
