@@ -17,7 +17,7 @@ from robotwin_environment import TaskEnv, evaluate, import_policy, read_settings
 from ugr_lightning.bridges import robotwin
 from ugr_lightning.bridges.deployment import scaled
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
-from ugr_lightning.rollout.runner import Runner, run_episodes
+from ugr_lightning.rollout.runner import Runner
 
 SIZE = (30, 40)
 
@@ -35,22 +35,20 @@ def fake_environment(size=SIZE):
     return TaskEnv(FakeSimulator("reach", image_size=size))
 
 
-def rolled_out(policy, seeds, execution):
-    results = run_episodes(
-        policy.for_inference(),
-        "reach",
-        seeds,
-        image_size=SIZE,
-        execution=execution,
-        workers=1,
-        simulator=FakeSimulator,
-        progress=False,
-    )
-    return {result.seed: (result.success, result.steps, result.motion_hash) for result in results}
+@pytest.fixture(scope="module")
+def rolled_out():
+    """What our own rollout makes of some seeds, in one process for all tests."""
+    with Runner("reach", image_size=SIZE, workers=1, timeout_s=300, simulator=FakeSimulator) as runner:
+
+        def roll(policy, seeds, execution):
+            results = runner.run(policy.for_inference(), seeds, execution=execution, progress=False)
+            return {result.seed: (result.success, result.steps, result.motion_hash) for result in results}
+
+        yield roll
 
 
 @pytest.mark.parametrize("policy", [Reacher(), Recaller(), tiny_act()], ids=["reacher", "recaller", "act"])
-def test_every_execution_moves_as_in_our_own_rollout(policy, tmp_path):
+def test_every_execution_moves_as_in_our_own_rollout(rolled_out, policy, tmp_path):
     checkpoint, seeds = save(policy, tmp_path / "a.ckpt"), [0, 1, 5, 6]
     for execution in ("aggregate", 1, 4):
         model = robotwin.get_model(settings(checkpoint, execution=execution))
@@ -191,7 +189,9 @@ def test_a_command_that_is_not_finite_never_reaches_the_robot(tmp_path):
     assert environment.take_action_cnt == 0
 
 
-def test_the_folder_is_imported_by_its_name_and_acts_like_the_package(reacher, tmp_path, monkeypatch, capsys):
+def test_the_folder_is_imported_by_its_name_and_acts_like_the_package(
+    rolled_out, reacher, tmp_path, monkeypatch, capsys
+):
     folder = tmp_path / "policy" / "UGR"
     written = robotwin.write_policy(reacher, folder, execution=3, copy=True)
     assert {path.name for path in written} == {path.name for path in folder.iterdir()}
@@ -255,7 +255,7 @@ class Client:
         return json.loads(json.dumps(value, default=pack), object_hook=unpack)
 
 
-def test_with_two_environments_robotwins_side_needs_no_package_of_ours(reacher, tmp_path, monkeypatch):
+def test_with_two_environments_robotwins_side_needs_no_package_of_ours(rolled_out, reacher, tmp_path, monkeypatch):
     folder = tmp_path / "policy" / "UGR"
     robotwin.write_policy(reacher, folder)
     client = Client(robotwin.get_model(settings(reacher)))

@@ -25,7 +25,7 @@ from ugr_lightning.bridges.xpolicylab.frames import read_frame
 from ugr_lightning.bridges.xpolicylab.model import CAMERAS, Model, find_checkpoint
 from ugr_lightning.contract import Statistics
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
-from ugr_lightning.rollout.runner import run_episodes
+from ugr_lightning.rollout.runner import Runner
 
 pytest.importorskip("msgpack", reason="the extra `xpolicylab` is not installed")
 pytest.importorskip("websockets", reason="the extra `xpolicylab` is not installed")
@@ -82,18 +82,16 @@ def vectors(actions):
     return np.stack([joints_of(action) for action in actions])
 
 
-def rolled_out(policy, seeds, execution):
-    results = run_episodes(
-        policy.for_inference(),
-        "reach",
-        seeds,
-        image_size=(30, 40),
-        execution=execution,
-        workers=1,
-        simulator=FakeSimulator,
-        progress=False,
-    )
-    return [(result.success, result.steps, result.motion_hash) for result in results]
+@pytest.fixture(scope="module")
+def rolled_out():
+    """What our own rollout makes of some seeds, in one process for all tests."""
+    with Runner("reach", image_size=(30, 40), workers=1, timeout_s=300, simulator=FakeSimulator) as runner:
+
+        def roll(policy, seeds, execution):
+            results = runner.run(policy.for_inference(), seeds, execution=execution, progress=False)
+            return [(result.success, result.steps, result.motion_hash) for result in results]
+
+        yield roll
 
 
 def fakes(seeds):
@@ -121,7 +119,7 @@ def adapter(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("execution", ["aggregate", 4])
 @pytest.mark.parametrize("policy", [Reacher(), Recaller(), tiny_act()], ids=["reacher", "recaller", "act"])
-def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, tmp_path, policy, execution):
+def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, rolled_out, tmp_path, policy, execution):
     seeds, folder = [0, 5, 6, 1], tmp_path / "XPolicyLab" / "policy" / "UGR"
     module = adapter(save(policy, tmp_path / "a.ckpt"), execution=execution, copy=True)
     expected = rolled_out(policy, seeds, execution)

@@ -52,7 +52,7 @@ def place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping
 
     Args:
         template: see `write_folder`.
-        checkpoint: the file.
+        checkpoint: the file, or the folder of `ugr export --to safetensors`.
         out: see `write_folder`.
         values: see `write_folder`.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
@@ -60,13 +60,19 @@ def place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping
     Returns:
         The files written.
     """
-    place = out / "policy_best.ckpt" if copy else checkpoint.resolve()
+    place = out / (checkpoint.name if checkpoint.is_dir() else "policy_best.ckpt") if copy else checkpoint.resolve()
     named = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
     written = write_folder(template, out, {**values, "CHECKPOINT": named})
     if not copy:
         return written
-    shutil.copyfile(checkpoint, place.with_name(place.name + ".partial"))
-    os.replace(place.with_name(place.name + ".partial"), place)
+    aside = place.with_name(place.name + ".partial")
+    if checkpoint.is_dir():
+        shutil.rmtree(aside, ignore_errors=True)
+        shutil.copytree(checkpoint, aside)
+        shutil.rmtree(place, ignore_errors=True)
+    else:
+        shutil.copyfile(checkpoint, aside)
+    os.replace(aside, place)
     return [*written, place]
 
 
