@@ -134,7 +134,8 @@ class EpisodeResult:
         seeds_hash: SHA-256 of the seed list the episode belongs to.
         policy: what acted: a checkpoint's policy class, or `zero`, `random`, `expert`.
         checkpoint: SHA-256 of the checkpoint file, or None.
-        execution: `aggregate`, or the number of steps executed of each chunk.
+        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), or the number of steps executed
+            of each chunk.
         success: whether the task's condition was met before the horizon; a crashed episode has False.
         steps: control steps executed.
         first_success_step: first step at which the condition was met, or None.
@@ -143,6 +144,8 @@ class EpisodeResult:
         seconds: wall-clock seconds by part (`query`, `simulate`).
         video: path of the recorded video, or None.
         crash: why the simulator or the policy failed, or None.
+        refine_ratio: share of each chunk that was refined, where it was chosen for the rollout; None where it was that
+            of the training, and in files from before there was this field.
     """
 
     task: str
@@ -160,6 +163,7 @@ class EpisodeResult:
     seconds: dict[str, float] = field(default_factory=dict)
     video: str | None = None
     crash: str | None = None
+    refine_ratio: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain containers, ready for JSON."""

@@ -4,8 +4,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from ugr_lightning.contract import CAMERAS
+from ugr_lightning.contract import CAMERAS, EpisodeResult
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.folder import episode_path, write_seeds
 from ugr_lightning.data.formats.robotwin import write_episode
@@ -109,6 +110,40 @@ def tiny_act():
         return policy
 
     return build
+
+
+@pytest.fixture
+def world(monkeypatch):
+    """Rollouts without a simulator; returns the calls."""
+    calls = []
+
+    def run_episodes(actor, task, seeds, *, on_result, video_dir, execution, **options):
+        calls.append({"actor": actor.name, "task": task, "seeds": seeds, "execution": execution, **options})
+        results = []
+        for seed in seeds:
+            result = EpisodeResult(
+                task,
+                "demo_clean",
+                seed,
+                options["seeds_hash"],
+                actor.name,
+                options["checkpoint"],
+                str(execution),
+                seed % 2 == 0,
+                10,
+                refine_ratio=actor.refine_ratio,
+            )
+            if video_dir and seed == seeds[0]:
+                result.video = str(Path(video_dir) / "a.gif")
+                Image.new("RGB", (4, 4)).save(result.video)
+            if on_result is not None:
+                on_result(result, None)
+            results.append(result)
+        return results
+
+    monkeypatch.setattr("ugr_lightning.rollout.runner.run_episodes", run_episodes)
+    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", lambda task: None)
+    return calls
 
 
 TINY = """

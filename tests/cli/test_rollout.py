@@ -6,41 +6,8 @@ from PIL import Image
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.cli.rollout import seed_list
-from ugr_lightning.contract import EpisodeResult
 from ugr_lightning.errors import ConfigError
-
-
-@pytest.fixture
-def world(monkeypatch):
-    """Rollouts without a simulator; returns the calls."""
-    calls = []
-
-    def run_episodes(actor, task, seeds, *, on_result, video_dir, execution, **options):
-        calls.append({"actor": actor.name, "task": task, "seeds": seeds, "execution": execution, **options})
-        results = []
-        for seed in seeds:
-            result = EpisodeResult(
-                task,
-                "demo_clean",
-                seed,
-                options["seeds_hash"],
-                actor.name,
-                options["checkpoint"],
-                str(execution),
-                seed % 2 == 0,
-                10,
-            )
-            if video_dir and seed == seeds[0]:
-                result.video = str(Path(video_dir) / "a.gif")
-                Image.new("RGB", (4, 4)).save(result.video)
-            if on_result is not None:
-                on_result(result, None)
-            results.append(result)
-        return results
-
-    monkeypatch.setattr("ugr_lightning.rollout.runner.run_episodes", run_episodes)
-    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", lambda: None)
-    return calls
+from ugr_lightning.rollout.results import read_results
 
 
 def test_rollout_prints_rate_and_interval_and_writes_a_line_per_episode(world, tmp_path, capsys):
@@ -80,6 +47,28 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
 def test_a_budget_for_a_dummy_is_refused(world, capsys):
     assert main(["rollout", "--policy", "zero", "--task", "click_alarmclock", "--refine_ratio", "0.5"]) == 2
     assert "--refine_ratio" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("chunk_length", "executed"), [(50, 25), (6, 6)])
+def test_what_a_test_executes_of_each_chunk_fits_the_checkpoint(
+    world, chunk_length, executed, tiny_act, untrained, tmp_path
+):
+    checkpoint = untrained(tiny_act(None, chunk_length), tmp_path)
+    assert main(["test", "--ckpt_path", str(checkpoint), "--episodes", "1"]) == 0
+    assert [call["execution"] for call in world] == ["aggregate", executed]
+
+
+def test_results_say_which_budget_was_chosen_and_a_test_that_goes_on_keeps_budgets_apart(
+    world, tiny_act, untrained, tmp_path
+):
+    checkpoint = untrained(tiny_act(), tmp_path)
+    command = ["test", "--ckpt_path", str(checkpoint), "--episodes", "2", "--executions", "[aggregate]", "--resume"]
+    for more in ([], ["--refine_ratio", "0"], ["--refine_ratio", "0.5"], ["--refine_ratio", "0.5"]):
+        assert main([*command, *more]) == 0
+    assert len(world) == 3, "the last had nothing left to do"
+    written = read_results(tmp_path / "evaluation.jsonl")
+    assert [item.refine_ratio for item in written] == [None, None, 0.0, 0.0, 0.5, 0.5]
+    assert len({item.policy for item in written}) == 3
 
 
 def test_seed_lists_are_what_they_say():

@@ -38,6 +38,15 @@ def test_results_survive_the_file(tmp_path):
     assert read_results(tmp_path / "deep" / "r.jsonl") == written
 
 
+def test_files_from_before_there_were_budgets_are_still_read(tmp_path):
+    path = tmp_path / "r.jsonl"
+    old = result().to_dict()
+    del old["refine_ratio"]
+    path.write_text(json.dumps(old) + "\n")
+    append_result(path, result(1, refine_ratio=0.5))
+    assert [item.refine_ratio for item in read_results(path)] == [None, 0.5]
+
+
 def test_a_line_cut_off_by_a_crash_does_not_swallow_the_next_one(tmp_path):
     path = tmp_path / "r.jsonl"
     append_result(path, result())

@@ -33,7 +33,7 @@ def _demo(
         run: name of the run.
     """
     from ugr_lightning.cli import fit
-    from ugr_lightning.cli.rollout import roll_out
+    from ugr_lightning.cli.rollout import both_executions, roll_out
     from ugr_lightning.cli.runs import resolve_checkpoint, versions_of
     from ugr_lightning.rollout.results import success_table
     from ugr_lightning.rollout.runner import Runners
@@ -52,8 +52,7 @@ def _demo(
         for policy, execution in (
             ("zero", "aggregate"),
             ("expert", "aggregate"),
-            (str(checkpoint), "aggregate"),
-            (str(checkpoint), 25),
+            *((str(checkpoint), execution) for execution in both_executions(checkpoint)),
         ):
             few = min(episodes, 10) if policy in ("zero", "expert") else episodes
             results += roll_out(

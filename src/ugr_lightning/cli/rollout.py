@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from ugr_lightning.rollout.runner import Runners
 
 ExecutionName = Literal["aggregate", "aggregate-variance"] | int
+EXECUTED_STEPS = 25
+"""Steps executed of each chunk, at most, where nothing else is asked for; half of a chunk of 50."""
 
 
 def _rollout(
@@ -36,8 +38,8 @@ def _rollout(
         policy: `zero`, `random`, `expert`, a checkpoint file, or a folder from `ugr export --to safetensors`.
         seeds: `evaluation` (the task's fixed list), `selection` (for choices of a recipe), or the first seed.
         episodes: how many of those seeds; null means 100, or 1 where only a video is asked for.
-        execution: `aggregate`; `aggregate-variance`, which also weights by the predicted variance; or the number of
-            steps executed of each chunk.
+        execution: `aggregate`; `aggregate-variance`, which aggregates with the inverse of the predicted variance; or
+            the number of steps executed of each chunk.
         setting: `demo_clean` or `demo_randomized`; null takes the checkpoint's.
         image_size: height and width of the pictures; null takes the checkpoint's.
         workers: simulator processes.
@@ -128,7 +130,8 @@ def roll_out(
             model, name = with_refine_ratio(model, refine_ratio), f"{name}(refine_ratio={refine_ratio:g})"
         task = task or trained.get("task")  # type: ignore[assignment]
         state, seen = trained.get("state", "commanded"), task_cameras(str(task))
-        actor = PolicyActor(model.for_inference(), name=name, state=state, cameras=seen)  # type: ignore[arg-type]
+        fast = model.for_inference()
+        actor = PolicyActor(fast, name=name, state=state, cameras=seen, refine_ratio=refine_ratio)  # type: ignore[arg-type]
     if task is None:
         raise ConfigError("--task", "a task", "none", "`ugr tasks` lists them.")
     if actor.cameras or video is not None:
@@ -215,7 +218,7 @@ def _test(
     root: str = "runs",
     task: str | None = None,
     episodes: int = 100,
-    executions: list[ExecutionName] = ["aggregate", 25],  # noqa: B006 - jsonargparse copies it
+    executions: list[ExecutionName] | None = None,
     workers: int = 2,
     out: str | None = None,
     traces: str | None = None,
@@ -230,7 +233,8 @@ def _test(
         root: folder of all runs.
         task: a name from `ugr tasks`; null takes the task the checkpoint was trained on.
         episodes: how many of the 100 evaluation seeds.
-        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk.
+        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk; null means
+            `aggregate` and 25, or the whole chunk where it is shorter.
         workers: simulator processes.
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
         traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
@@ -244,7 +248,7 @@ def _test(
     print(f"checkpoint: {checkpoint}")
     results = []
     with Runners() as simulators:
-        for execution in executions:
+        for execution in executions or both_executions(checkpoint):
             beside = checkpoint if checkpoint.is_dir() else checkpoint.parent
             file = Path(out) if out else beside / "evaluation.jsonl"
             results += roll_out(
@@ -262,6 +266,14 @@ def _test(
             )
     print(success_table(results))
     return 0
+
+
+def both_executions(checkpoint: Path) -> list[ExecutionName]:
+    """Aggregation, and 25 steps of each chunk or the whole of it where it is shorter."""
+    from ugr_lightning.training.checkpoint import load_policy
+
+    policy, _ = load_policy(checkpoint)
+    return ["aggregate", min(EXECUTED_STEPS, policy.chunk_length)]
 
 
 def newest_run(root: Path) -> str:

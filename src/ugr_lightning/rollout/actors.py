@@ -35,10 +35,12 @@ class Actor(ABC):
         name: what results call it.
         execution: how chunks are executed, as results say it; `1` where there are no chunks.
         cameras: the pictures it needs; without any the simulators do not render.
+        refine_ratio: share of each chunk that is refined, where that is not as in training.
     """
 
     name: str
     execution: str = "1"
+    refine_ratio: float | None = None
     cameras: tuple[str, ...] = ()
 
     def begin(self, slots: int, execution: str | int) -> None:  # noqa: B027 - most have nothing to prepare
@@ -140,6 +142,7 @@ class PolicyActor(Actor):
         name: what results call it; None takes the name of its class.
         state: what it sees of the joints, `commanded` or `measured`; as in its training.
         cameras: those of the simulator, in the order of its frames.
+        refine_ratio: share of each chunk that the policy refines, where that is not as in its training; for results.
     """
 
     def __init__(
@@ -149,12 +152,13 @@ class PolicyActor(Actor):
         name: str | None = None,
         state: Literal["commanded", "measured"] = "commanded",
         cameras: Sequence[str] = CAMERAS,
+        refine_ratio: float | None = None,
     ) -> None:
         unknown = [camera for camera in policy.cameras if camera not in cameras]
         if unknown:
             fix = "Roll out a policy that was trained on these cameras."
             raise CheckpointError("policy.cameras", f"cameras among {', '.join(cameras)}", ", ".join(unknown), fix)
-        self.policy, self.state = policy, state
+        self.policy, self.state, self.refine_ratio = policy, state, refine_ratio
         self.name = name or type(policy).__name__
         self.cameras = tuple(policy.cameras)
         self._views = [list(cameras).index(camera) for camera in self.cameras]

@@ -195,6 +195,7 @@ class LockStep:
             **self._stamp,
             seed=episode.seed,
             execution=self._actor.execution,
+            refine_ratio=self._actor.refine_ratio,
             success=success,
             steps=episode.steps,
             first_success_step=episode.steps if success else None,

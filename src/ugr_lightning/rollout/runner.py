@@ -235,7 +235,7 @@ def run_episodes(
         seeds: which episodes.
         setting: how the surroundings vary.
         image_size: height and width of the pictures; those the policy was trained on.
-        execution: `aggregate` or the number of steps executed of each chunk.
+        execution: `aggregate`, `aggregate-variance` or the number of steps executed of each chunk.
         workers: simulator processes.
         slots_per_worker: simulators per process.
         checkpoint: SHA-256 of the policy's checkpoint, for the results.
