@@ -109,7 +109,7 @@ class _Decoder:
     def __init__(self, path: Path) -> None:
         av = import_av()
         self.container = av.open(str(path))
-        self.stream = self.container.streams.video[0]
+        self.stream = _first_stream(self.container)
         self.stream.codec_context.thread_count = 1  # episodes are decoded beside each other, see `data.cache`
         self.convert = av.video.reformatter.VideoReformatter()
         self.coming: Iterator[Any] = iter(())
@@ -141,6 +141,13 @@ class _Decoder:
         return next(frame for frame in self.coming if frame.pts is not None)
 
 
+def _first_stream(container: Any) -> Any:
+    stream = container.streams.video[0]
+    if stream.codec_context is None:
+        raise ValueError("a codec that PyAV does not know")
+    return stream
+
+
 def check_video(path: Path) -> tuple[tuple[int, int], float]:
     """Open a video and see what it says of itself.
 
@@ -162,7 +169,7 @@ def _checked(path: Path, size: int, changed_ns: int) -> tuple[tuple[int, int], f
     av = import_av()
     try:
         with av.open(str(path)) as container:
-            stream = container.streams.video[0]
+            stream = _first_stream(container)
             shape = (stream.height, stream.width)
             ticks = (stream.start_time or 0) + (stream.duration or 0)
             end = float(ticks * stream.time_base)

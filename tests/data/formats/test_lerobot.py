@@ -368,7 +368,12 @@ def test_missing_short_and_foreign_videos_are_one_clear_error(tmp_path):
     assert read(folder, 0).length == 9
     with pytest.raises(DataError, match=r"cam_high.*longer than.*got 0\.667 s"):
         read(folder, 1)
-    for content, message in ((b"text", "readable video"), (good[: len(good) // 2], "readable video")):
+    unknown = good.replace(b"avc1", b"xxxx")
+    for content, message in (
+        (b"text", "readable video"),
+        (good[: len(good) // 2], "readable video"),
+        (unknown, "codec"),
+    ):
         path.write_bytes(content)
         with pytest.raises(DataError, match=message):
             read(folder)
