@@ -16,6 +16,7 @@ from robotwin_environment import TaskEnv, evaluate, import_policy, read_settings
 
 from ugr_lightning.bridges import robotwin
 from ugr_lightning.bridges.deployment import scaled
+from ugr_lightning.bridges.export import export_policy
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
 from ugr_lightning.rollout.runner import Runner
 
@@ -203,6 +204,20 @@ def test_the_folder_is_imported_by_its_name_and_acts_like_the_package(
     assert evaluate(package, model, fake_environment(), [0, 5]) == rolled_out(Reacher(), [0, 5], 3)
     model = package.get_model(read_settings(folder, "--execution", "aggregate", "--temporal_agg", "true"))
     assert evaluate(package, model, fake_environment(), [0, 5]) == rolled_out(Reacher(), [0, 5], "aggregate")
+
+
+def test_an_exported_folder_is_a_checkpoint_too_and_can_be_copied(tmp_path, monkeypatch):
+    exported, folder = tmp_path / "exported", tmp_path / "policy" / "UGR"
+    export_policy(save(tiny_act(), tmp_path / "a.ckpt"), "safetensors", exported)
+    for _ in range(2):  # the second replaces the first
+        robotwin.write_policy(exported, folder, execution=5, copy=True)
+    shutil.rmtree(exported)
+    package = import_policy(folder, monkeypatch)
+    same = robotwin.get_model(settings(tmp_path / "a.ckpt", execution=5))
+    outcomes = [
+        evaluate(robotwin, model, fake_environment(), [0]) for model in (same, package.get_model(read_settings(folder)))
+    ]
+    assert outcomes[0] == outcomes[1]
 
 
 def test_the_scripts_of_the_folder_are_valid_and_say_how_to_call_them(reacher, tmp_path):
