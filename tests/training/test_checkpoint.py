@@ -1,3 +1,4 @@
+import random
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +68,24 @@ def test_damaged_missing_and_foreign_files_are_refused_in_one_paragraph(tmp_path
     for path in (cut, foreign, tmp_path / "none.ckpt"):
         with pytest.raises(CheckpointError, match=path.name):
             load_policy(path)
+
+
+@pytest.mark.parametrize("zipped", [True, False], ids=["today's files", "files of torch before 1.6"])
+def test_a_damaged_file_is_never_a_crash(tmp_path, zipped):
+    content = {"state_dict": {f"policy.layer{i}": torch.arange(3.0) + i for i in range(4)}, "step": 1}
+    torch.save(content, tmp_path / "whole.ckpt", _use_new_zipfile_serialization=zipped)
+    whole, draw, path = (tmp_path / "whole.ckpt").read_bytes(), random.Random(0), tmp_path / "damaged.ckpt"
+    refused = 0
+    for _ in range(150):
+        damaged = bytearray(whole)
+        for _ in range(draw.choice((1, 2, 8))):
+            damaged[draw.randrange(len(damaged))] = draw.randrange(256)
+        path.write_bytes(damaged[: draw.randrange(len(damaged))] if draw.random() < 0.2 else damaged)
+        try:
+            read_checkpoint(path)
+        except CheckpointError:
+            refused += 1
+    assert refused > 30
 
 
 def test_another_camera_set_is_refused(checkpoint):

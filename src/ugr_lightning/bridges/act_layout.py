@@ -61,13 +61,13 @@ def _swap(name: str, pairs: Sequence[tuple[str, str]]) -> str | None:
     return None
 
 
-def checked_tensors(content: Mapping[str, Any], where: object, ignore: str = "\0") -> dict[str, Tensor]:
+def checked_tensors(content: Mapping[str, Any], where: object, ignore: tuple[str, ...] = ()) -> dict[str, Tensor]:
     """The tensors of a state dict, once each is known to be what it claims.
 
     Args:
         content: what a file holds.
         where: the file, for messages.
-        ignore: entries with this prefix are left out.
+        ignore: entries that begin with one of these are left out.
 
     Returns:
         float32 for floating-point entries; other kinds unchanged.

@@ -44,7 +44,8 @@ class _Recorded:
     """What a pickle asks for: remembers its arguments and its state."""
 
     def __init__(self, *arguments: Any) -> None:
-        self.arguments, self.state = arguments, None
+        self.arguments: tuple[Any, ...] = arguments
+        self.state: Any = None
 
     def __setstate__(self, state: Any) -> None:
         self.state = state
@@ -95,7 +96,7 @@ _ADMITTED: dict[tuple[str, str], type] = {
 }
 
 
-class _Unpickler(pickle._Unpickler):  # type: ignore[name-defined]
+class _Unpickler(pickle._Unpickler):
     """Knows the names above and no others. Python's own, because the one in C reserves what a file merely announces."""
 
     def find_class(self, module: str, name: str) -> type:
@@ -184,7 +185,7 @@ def _numbers(value: Any, where: str) -> Tensor:
 
 def _array(value: Any) -> np.ndarray:
     if isinstance(value, _Array):
-        _, shape, kind, by_columns, raw = value.state  # type: ignore[misc]
+        _, shape, kind, by_columns, raw = value.state
         return _from_bytes(raw, kind, shape, "F" if by_columns else "C")
     if isinstance(value, _Buffer):
         raw, kind, shape, order = value.arguments
@@ -207,7 +208,7 @@ def _from_bytes(raw: Any, kind: Any, shape: Any, order: str) -> np.ndarray:
     if code[:1] not in "fiub" or not code[1:].isdigit():
         raise TypeError(f"numbers of the kind {code!r}")
     byte_order = kind.state[1] if isinstance(kind.state, tuple) and len(kind.state) > 1 else "="
-    dtype = np.dtype(code).newbyteorder("=" if byte_order not in ("<", ">") else byte_order)
+    dtype = np.dtype(code).newbyteorder(">" if byte_order == ">" else "<" if byte_order == "<" else "=")
     shape = tuple(int(axis) for axis in shape)
     if math.prod(shape) * dtype.itemsize != len(raw):
         raise ValueError(f"{len(raw)} bytes for the shape {shape}")
