@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from ugr_lightning.analysis.budgets import RATIOS, refined_error, sweep, sweep_figure, sweep_table
+from ugr_lightning.analysis.budgets import RATIOS, budget_errors, refined_error, sweep, sweep_figure, sweep_table
 from ugr_lightning.analysis.predictions import Predictions
 from ugr_lightning.contract import Observation, Statistics
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
+from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 
 N, K = 12, 10
@@ -62,6 +63,19 @@ def test_the_sweep_starts_at_coarse_ends_at_full_and_no_rule_beats_the_one_that_
     assert found.against_coarse["learned"][0] == (0, 0, 0)
     assert len(sweep_table(found)) == 12
     assert len(sweep_figure(found).axes[0].lines) == 7
+
+
+@pytest.mark.parametrize("selector", [Uncertainty, Tail])
+def test_the_error_of_each_budget_is_that_of_the_policys_own_selector(selector):
+    act = policy("mlp")
+    act.refine = selector()
+    everything = predictions(with_refine_ratio(act, 1.0))
+    found = budget_errors(act, everything, (0.0, 0.3, 1.0))
+    own = predictions(with_refine_ratio(act, 0.3)).executed
+    wanted = [everything.coarse.mean(), own.mean(), everything.executed.mean()]
+    assert [one.error.value for one in found] == pytest.approx(wanted, abs=1e-6)
+    assert found[0].against_coarse == (0, 0, 0)
+    assert found[1].against_coarse.value == pytest.approx(wanted[1] - wanted[0], abs=1e-6)
 
 
 def test_padded_steps_are_neither_chosen_nor_counted():

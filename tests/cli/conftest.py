@@ -112,10 +112,18 @@ def tiny_act():
     return build
 
 
+class Calls(list):
+    """What rollouts were asked for; `succeeds` decides what comes of them."""
+
+    @staticmethod
+    def succeeds(seed, actor, execution):
+        return seed % 2 == 0
+
+
 @pytest.fixture
 def world(monkeypatch):
     """Rollouts without a simulator; returns the calls."""
-    calls = []
+    calls = Calls()
 
     def run_episodes(actor, task, seeds, *, on_result, video_dir, execution, **options):
         calls.append({"actor": actor.name, "task": task, "seeds": seeds, "execution": execution, **options})
@@ -129,7 +137,7 @@ def world(monkeypatch):
                 actor.name,
                 options["checkpoint"],
                 str(execution),
-                seed % 2 == 0,
+                calls.succeeds(seed, actor, execution),
                 10,
                 refine_ratio=actor.refine_ratio,
             )

@@ -1,5 +1,6 @@
 """One checkpoint, many budgets: the error after refining more or fewer steps, chosen by s_k and by its rivals."""
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -7,6 +8,8 @@ import torch
 
 from ugr_lightning.analysis.calibration import Interval, bootstrap, position_mean
 from ugr_lightning.analysis.predictions import Predictions
+from ugr_lightning.contract import ChunkPolicy
+from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.models.refine.head import Head
 from ugr_lightning.models.refine.oracle import Oracle
 from ugr_lightning.models.refine.prior import Prior
@@ -99,6 +102,40 @@ def sweep(
     table = {name: found[i : len(totals) : len(names)] for i, name in enumerate(names)}
     differences = {name: found[len(totals) + i :: len(names)] for i, name in enumerate(names)}
     return Sweep(tuple(ratios), table, differences)
+
+
+class BudgetError(NamedTuple):
+    """Mean error of the executed actions with one budget, and the same minus that of the coarse actions."""
+
+    error: Interval
+    against_coarse: Interval
+
+    def signed(self) -> str:
+        """The difference as a cell."""
+        return _signed(self.against_coarse)
+
+
+def budget_errors(policy: ChunkPolicy, everything: Predictions, ratios: Sequence[float]) -> list[BudgetError]:
+    """Error on the validation episodes when the policy's own selector spends each budget.
+
+    Args:
+        policy: one that ranks steps.
+        everything: its predictions with all steps refined.
+        ratios: shares of the chunk; what rounds down to no step refines none.
+    """
+    known = ~np.isnan(everything.coarse)
+    score = np.zeros(known.shape) if everything.log_variance is None else everything.log_variance
+    errors = []
+    for ratio in ratios:
+        selector: Any = getattr(with_refine_ratio(policy, ratio), "refine", None)
+        errors.append(everything.coarse if selector is None else refined_error(everything, selector, score))
+    sums, coarse = np.nansum(errors, axis=2), np.nansum(everything.coarse, axis=1)  # (ratios, n), (n,)
+
+    def means(rows: np.ndarray) -> np.ndarray:
+        return np.concatenate([sums[:, rows].sum(1), (sums[:, rows] - coarse[rows]).sum(1)]) / known[rows].sum()
+
+    found = bootstrap(means, everything.episode)
+    return [BudgetError(*pair) for pair in zip(found[: len(errors)], found[len(errors) :], strict=True)]
 
 
 def sweep_table(found: Sweep) -> list[tuple[str, ...]]:

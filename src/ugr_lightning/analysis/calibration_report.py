@@ -17,6 +17,10 @@ NEAR = 5
 RECALL, WITHIN = "recall of the worst steps", "Spearman within position"
 
 
+Cells = list[tuple[str, ...]]
+"""A table, heading first."""
+
+
 class Row(NamedTuple):
     """One statistic of the predicted uncertainty beside those of simpler rivals.
 

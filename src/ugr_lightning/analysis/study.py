@@ -2,6 +2,7 @@
 
 import json
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -20,8 +21,6 @@ from ugr_lightning.errors import CheckpointError, ConfigError, DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.rollout.traces import read_traces
-
-Cells = list[tuple[str, ...]]
 
 
 @dataclass
@@ -49,7 +48,7 @@ class Study:
     resamples: int
     budget: int
     content: dict[str, Any]
-    tables: list[Cells]
+    tables: list[report.Cells]
     figures: dict[str, Any]
     sentences: list[str] = field(default_factory=list)
 
@@ -58,15 +57,39 @@ class Study:
 
     def write(self, folder: Path) -> None:
         """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
-        title = f"# Uncertainty of {self.content['checkpoint']['file']}"
-        pictures = [f"![{name}]({name}.png)" for name in self.figures]
-        page = "\n\n".join([title, *self.sentences, *map(report.as_markdown, self.tables), *pictures])
-        numbers = json.dumps(plain(self.content), indent=1, allow_nan=False)
+        title = f"Uncertainty of {self.content['checkpoint']['file']}"
+        write_page(folder, "analysis", title, self.sentences, self.tables, self.figures, self.content)
         prior = json.dumps(plain(self.content["position"]["training_error"]))
-        for name, text in (("analysis.json", numbers), ("prior.json", prior), ("analysis.md", page)):
-            publish(folder / name, partial(_write_text, text + "\n"))
-        for name, figure in self.figures.items():
-            publish(folder / f"{name}.png", partial(figure.savefig, format="png", dpi=120))
+        publish(folder / "prior.json", partial(_write_text, prior + "\n"))
+
+
+def write_page(
+    folder: Path,
+    name: str,
+    title: str,
+    sentences: Sequence[str],
+    tables: Sequence[report.Cells],
+    figures: dict[str, Any],
+    content: dict[str, Any],
+) -> None:
+    """Write `<name>.md`, `<name>.json` and the figures into a folder.
+
+    Args:
+        folder: made if missing.
+        name: of the files.
+        title: heading of the page.
+        sentences: what the page says first.
+        tables: cells, heading first.
+        figures: by the name of their file.
+        content: numbers.
+    """
+    pictures = [f"![{figure}]({figure}.png)" for figure in figures]
+    page = "\n\n".join([f"# {title}", *sentences, *map(report.as_markdown, tables), *pictures])
+    numbers = json.dumps(plain(content), indent=1, allow_nan=False)
+    for file, text in ((f"{name}.json", numbers), (f"{name}.md", page)):
+        publish(folder / file, partial(_write_text, text + "\n"))
+    for file, figure in figures.items():
+        publish(folder / f"{file}.png", partial(figure.savefig, format="png", dpi=120))
 
 
 def begin_study(

@@ -17,6 +17,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
     "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
     "analyze": ("ugr_lightning.cli.analyze:run", "whether a checkpoint's uncertainty knows the error"),
+    "sweep": ("ugr_lightning.cli.sweep:run", "one checkpoint with many budgets and executions, in closed loop"),
     "benchmark": (
         "ugr_lightning.cli.benchmark:run",
         "policies, tasks and training seeds of one yaml: record, train, evaluate",

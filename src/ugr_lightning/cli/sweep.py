@@ -1,0 +1,188 @@
+"""`ugr sweep`: one checkpoint with many refinement budgets and several executions, in closed loop."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from ugr_lightning.cli.call import call
+from ugr_lightning.cli.rollout import ExecutionName, both_executions, newest_run, roll_out
+from ugr_lightning.cli.runs import resolve_checkpoint
+from ugr_lightning.contract import ChunkPolicy, EpisodeResult
+from ugr_lightning.errors import ConfigError
+
+VARIANCE = "aggregate-variance"
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr sweep`."""
+    return call(_sweep, command, argv)
+
+
+def _sweep(
+    ckpt_path: str = "best",
+    run: str | None = None,
+    root: str = "runs",
+    seeds: Literal["selection", "evaluation"] | int = "selection",
+    episodes: int = 100,
+    ratios: list[float] | None = None,
+    executions: list[ExecutionName] | None = None,
+    data: str | None = "data/160x120",
+    stride: int = 5,
+    workers: int = 2,
+    out: str | None = None,
+) -> int:
+    """Success of one checkpoint by refinement budget and by execution, on the same seeds; goes on where it was stopped.
+
+    Args:
+        ckpt_path: `best`, `best_loss`, `last`, a checkpoint file, or a folder from `ugr export --to safetensors`.
+        run: name or folder of a run; null takes the newest run.
+        root: folder of all runs.
+        seeds: `selection` (a budget may be chosen by them), `evaluation` (only to report), or the first seed.
+        episodes: how many of those seeds, for each budget and for each execution.
+        ratios: budgets as shares of the chunk; 0 and the one of the training are added; null means tenths from 0 to 1,
+            `[]` leaves budgets out, for policies that do not rank steps.
+        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk; budgets are
+            compared in the first, the others with it. Null means all three that the policy can.
+        data: folder of the recordings that the policy was trained on, for the offline error; null leaves it out.
+        stride: control steps between two queries of the offline error.
+        workers: simulator processes.
+        out: folder for episodes, tables and figure; null means `sweep-<checkpoint>` beside the checkpoint.
+    """
+    from ugr_lightning.cli.lock import locked
+
+    for name, value in (("--episodes", episodes), ("--stride", stride)):
+        if value < 1:
+            raise ConfigError(name, "at least 1", value, "Correct the number.")
+    checkpoint = resolve_checkpoint(ckpt_path, run or newest_run(Path(root)), Path(root))
+    plan = _plan(checkpoint, ratios, executions)
+    print(f"checkpoint: {checkpoint}")
+    errors = _offline(plan, data, stride) if plan.ratios and data is not None else None
+    folder = Path(out) if out else checkpoint.with_name(f"sweep-{checkpoint.stem}")
+    with locked(folder / "sweep.lock", str(folder)):
+        budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers)
+        _report(plan, budgets, modes, errors, folder)
+    return 0
+
+
+class Plan(NamedTuple):
+    """What is to be tried.
+
+    Args:
+        checkpoint: its file.
+        policy: from the checkpoint.
+        info: what the checkpoint says about itself.
+        trained: share of a chunk that it refines as trained; None where it ranks no steps.
+        ratios: budgets, 0 first; empty where none are asked for.
+        executions: the first is that of the budgets.
+    """
+
+    checkpoint: Path
+    policy: ChunkPolicy
+    info: Any
+    trained: float | None
+    ratios: list[float]
+    executions: list[ExecutionName]
+
+
+def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[ExecutionName] | None) -> Plan:
+    """What is asked for, once it is clear that the policy can do all of it."""
+    from ugr_lightning.analysis.budgets import RATIOS
+    from ugr_lightning.models.refine.budget import with_refine_ratio
+    from ugr_lightning.rollout.aggregation import make_execution
+    from ugr_lightning.training.checkpoint import load_policy
+
+    policy, info = load_policy(checkpoint)
+    wanted = list(RATIOS) if ratios is None else ratios
+    for ratio in wanted:
+        with_refine_ratio(policy, ratio)
+    trained: Any = getattr(getattr(policy, "refine", None), "ratio", None)
+    tried: list[float] = sorted({0.0, trained, *wanted}) if wanted else []
+    certain = _predicts_variance(policy, info.data.get("image_size"))
+    first, *others = both_executions(checkpoint)
+    chosen = executions or [first, *([VARIANCE] if certain else []), *others]
+    for execution in chosen:
+        make_execution(execution, policy.chunk_length)
+    if VARIANCE in chosen and not certain:
+        fix = "Leave it out, or train with `uncertainty_head: true`."
+        raise ConfigError(f"--executions {VARIANCE}", "a policy with a log-variance per step", "one without", fix)
+    return Plan(checkpoint, policy, info, trained, tried, list(dict.fromkeys(chosen)))
+
+
+def _predicts_variance(policy: ChunkPolicy, image_size: Sequence[int] | None) -> bool:
+    """Whether chunks come with a log-variance; asked with an empty observation."""
+    import torch
+
+    from ugr_lightning.contract import Observation
+
+    rows = (1,) if policy.observation_steps == 1 else (1, policy.observation_steps)
+    images = torch.zeros(*rows, len(policy.cameras), 3, *(image_size or (120, 160)), dtype=torch.uint8)
+    with torch.no_grad():
+        chunk = policy.predict(Observation(images, torch.zeros(*rows, policy.state_dim)))
+    return chunk.log_variance is not None
+
+
+def _offline(plan: Plan, data: str, stride: int) -> list[Any]:
+    """The error of each budget on the validation episodes."""
+    from ugr_lightning.analysis.budgets import budget_errors
+    from ugr_lightning.analysis.predictions import open_data, predict
+    from ugr_lightning.models.refine.budget import with_refine_ratio
+
+    opened = open_data(plan.policy, plan.info.data, data)
+    whole = with_refine_ratio(plan.policy, 1.0).for_inference()
+    everything = predict(whole, opened, opened.episode_split.validation, stride=stride)
+    return budget_errors(plan.policy, everything, plan.ratios)
+
+
+Episodes = dict[str, Sequence[EpisodeResult]]
+
+
+def _closed_loop(
+    plan: Plan, file: Path, seeds: Literal["selection", "evaluation"] | int, episodes: int, workers: int
+) -> tuple[Episodes, Episodes]:
+    """Episodes by name of the budget and by name of the execution; only those that the file lacks are run."""
+    from ugr_lightning.analysis.closed_loop import budget_name, execution_name
+    from ugr_lightning.rollout.runner import Runners
+
+    with Runners() as simulators:
+
+        def act(ratio: float | None, execution: ExecutionName) -> list[EpisodeResult]:
+            return roll_out(
+                str(plan.checkpoint),
+                None,
+                seeds=seeds,
+                episodes=episodes,
+                execution=execution,
+                workers=workers,
+                out=file,
+                refine_ratio=None if ratio == plan.trained else ratio,
+                resume=True,
+                keep=simulators,
+            )
+
+        modes = {execution_name(execution): act(None, execution) for execution in plan.executions}
+        budgets = {budget_name(ratio, plan.trained): act(ratio, plan.executions[0]) for ratio in plan.ratios}
+    return budgets, modes
+
+
+def _report(plan: Plan, budgets: Episodes, modes: Episodes, errors: list[Any] | None, folder: Path) -> None:
+    """Print and write what was found."""
+    from ugr_lightning.analysis import closed_loop as kit
+    from ugr_lightning.analysis.calibration_report import as_text
+    from ugr_lightning.analysis.study import write_page
+
+    tables, figures, sentences = [], {}, []
+    content: dict[str, Any] = {"checkpoint": {"file": str(plan.checkpoint), "sha256": plan.info.sha256}}
+    if budgets:
+        uses = kit.compare_uses(budgets)
+        steps = [int(ratio * plan.policy.chunk_length + 1e-9) for ratio in plan.ratios]
+        tables.append(kit.budget_table(uses, steps, errors))
+        figures["budgets"] = kit.budget_figure(uses, plan.ratios, errors)
+        sentences.append(f"Budgets, {kit.execution_name(plan.executions[0])}. {kit.verdict(uses, 'budget')}")
+        content["budgets"] = {"ratios": plan.ratios, "steps": steps, "uses": kit.use_records(uses), "offline": errors}
+    uses = kit.compare_uses(modes)
+    tables.append(kit.execution_table(uses))
+    sentences.append(f"Executions, budget as trained. {kit.verdict(uses, 'execution')}")
+    content["executions"] = kit.use_records(uses)
+    print("\n\n".join([*map(as_text, tables), *sentences]))
+    write_page(folder, "sweep", f"Uses of {plan.checkpoint}", sentences, tables, figures, content)
+    print(f"episodes, numbers, tables and figure: {folder}")

@@ -1,0 +1,104 @@
+"""`ugr sweep` from a checkpoint to its tables, without a simulator."""
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from ugr_lightning.cli.lock import locked
+from ugr_lightning.cli.main import main
+from ugr_lightning.rollout.results import read_results
+
+
+@pytest.fixture
+def command(world, tiny_act, untrained, tmp_path, ten_demonstrations):
+    """The command line for an ACT of ten steps that learned nothing, on ten seeds."""
+    checkpoint = untrained(tiny_act(), tmp_path)
+    return f"sweep --ckpt_path {checkpoint} --data {ten_demonstrations} --episodes 10 --ratios [0.5,1]".split()
+
+
+def test_a_sweep_tries_budgets_and_executions_on_the_same_selection_seeds(command, world, capsys, tmp_path):
+    world.succeeds = lambda seed, actor, execution: actor.refine_ratio != 1
+    assert main(command) == 0
+    asked = [(call["actor"], call["execution"]) for call in world]
+    assert asked == [
+        ("ACT", "aggregate"),
+        ("ACT", "aggregate-variance"),
+        ("ACT", 10),
+        ("ACT(refine_ratio=0)", "aggregate"),
+        ("ACT(refine_ratio=0.5)", "aggregate"),
+        ("ACT(refine_ratio=1)", "aggregate"),
+    ], "the budget of the training has been tried among the executions"
+    assert all(call["seeds"] == list(range(200000, 200010)) for call in world)
+    said, folder = capsys.readouterr().out, tmp_path / "sweep-policy_best"
+    page = (folder / "sweep.md").read_text()
+    for text in (
+        "| nothing (coarse) | 0 |",
+        "| 30%, as trained | 3 |",
+        "10/10 = 100.0% | [72.2%, 100.0%] | 0 | +0.0% [-27.8%, +27.8%] | 0 / 0 |",
+        "| 100% | 10 |",
+        "| 0 / 10 | 0.00195 | 0.00586 |",
+        "| `aggregate-variance`: chunks aggregated with inverse variance |",
+        "Success differs from that of nothing (coarse)",
+        "No execution can be told apart from `aggregate`",
+    ):
+        assert text in page or text in said, text
+    found = json.loads((folder / "sweep.json").read_text())
+    assert found["budgets"]["ratios"] == [0, 0.3, 0.5, 1]
+    assert [use["successes"] for use in found["budgets"]["uses"]] == [10, 10, 10, 0]
+    assert found["budgets"]["offline"][0]["against_coarse"]["value"] == 0
+    assert found["budgets"]["offline"][3]["against_coarse"]["value"] != 0
+    assert len(read_results(folder / "episodes.jsonl")) == 60
+    assert np.asarray(Image.open(folder / "budgets.png")).std() > 0
+
+
+def test_a_sweep_that_was_stopped_runs_only_what_is_missing(command, world, tmp_path, capsys):
+    assert main([*command, "--data", "null"]) == 0
+    whole = capsys.readouterr().out
+    file = tmp_path / "sweep-policy_best" / "episodes.jsonl"
+    lines = file.read_text().splitlines(keepends=True)
+    file.write_text("".join(lines[:43]) + lines[43][:20])
+    world.clear()
+    assert main([*command, "--data", "null"]) == 0
+    assert [(call["actor"], len(call["seeds"])) for call in world] == [
+        ("ACT(refine_ratio=0.5)", 7),
+        ("ACT(refine_ratio=1)", 10),
+    ]
+    assert capsys.readouterr().out == whole
+    assert "offline error" not in whole
+
+
+def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
+    world, tiny_act, untrained, tmp_path, ten_demonstrations, capsys
+):
+    checkpoint = untrained(tiny_act(None), tmp_path)
+    command = ["sweep", "--ckpt_path", str(checkpoint), "--episodes", "2"]
+    assert main(command) == 2
+    assert "ranking" in capsys.readouterr().err
+    assert main([*command, "--ratios", "[]"]) == 0
+    assert [call["execution"] for call in world] == ["aggregate", 10]
+    assert main([*command, "--ratios", "[]", "--executions", "[aggregate-variance]"]) == 2
+    assert "log-variance" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ("--ratios [1.5]", "from 0 to 1"),
+        ("--executions [11]", "1 to 10"),
+        ("--episodes 0", "--episodes"),
+        ("--data nowhere", "nowhere"),
+    ],
+)
+def test_what_is_impossible_is_said_before_any_episode(command, world, options, says, capsys):
+    assert main([*command, *options.split()]) == 2
+    assert says in capsys.readouterr().err
+    assert world == []
+
+
+def test_two_sweeps_cannot_write_one_folder(command, world, tmp_path, capsys):
+    with locked(tmp_path / "sweep-policy_best" / "sweep.lock", "test"):
+        assert main([*command, "--data", "null"]) == 2
+    assert "a folder that nobody else writes" in capsys.readouterr().err
+    assert world == []
