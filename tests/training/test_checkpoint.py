@@ -70,6 +70,7 @@ def test_damaged_missing_and_foreign_files_are_refused_in_one_paragraph(tmp_path
             load_policy(path)
 
 
+@pytest.mark.filterwarnings("ignore:Detected pickle protocol")
 @pytest.mark.parametrize("zipped", [True, False], ids=["today's files", "files of torch before 1.6"])
 def test_a_damaged_file_is_never_a_crash(tmp_path, zipped):
     content = {"state_dict": {f"policy.layer{i}": torch.arange(3.0) + i for i in range(4)}, "step": 1}
