@@ -56,7 +56,9 @@ def export_graph(policy: ChunkPolicy, observation: Observation, path: Path) -> N
     Raises:
         ConfigError: a policy without such a graph.
     """
-    torch.export.save(_trace(policy, observation), path)
+    program = _trace(policy, observation)
+    with _quiet():
+        torch.export.save(program, path)
 
 
 def load_graph(path: Path) -> Graph:
