@@ -4,6 +4,7 @@ import importlib
 import inspect
 import json
 import pkgutil
+from pathlib import Path
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from ugr_lightning.models.refine.selector import Selector
 from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 
+CONFIGS = Path(__file__).parents[3] / "configs"
 STEPS = 50
 ARGUMENTS = {Prior: {"errors": [float(k % 7) for k in range(STEPS)]}}  # of those that have no defaults
 
@@ -55,6 +57,17 @@ def test_the_selectors_of_the_paper_are_discovered():
 
 def test_the_controls_are_discovered():
     assert {Head, Tail, Scattered, Prior, Oracle} <= set(discovered())
+
+
+@every_selector
+def test_has_a_yaml_that_trains_it_unless_no_policy_can_act_with_it(kind):
+    named = f"class_path: {kind.__module__}.{kind.__name__}\n"
+    configs = [path.name for path in CONFIGS.rglob("*.yaml") if named in path.read_text()]
+    assert bool(configs) != kind.offline, configs
+
+
+def test_the_oracle_alone_is_for_offline_comparisons():
+    assert [kind for kind in discovered() if kind.offline] == [Oracle]
 
 
 @every_selector
