@@ -9,14 +9,15 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 BUILD = ["hatchling>=1.27", "editables"]  # the package itself is installed without build isolation
-# gym-aloha is installed for its meshes only; its simulator (MuJoCo, dm-control) is never imported.
+# gym-aloha is installed for its meshes; what its simulator needs is the extra `aloha`.
 WITHOUT_DEPENDENCIES = ("gym-aloha",)
 # ManiSkill asks for the OpenCV build with windows, which wants libGL from the machine; the headless one does not.
 REPLACED = {"opencv-python": "opencv-python-headless"}
 HEADER = """\
 # Every package of the environment at its exact version. Written by `make lock`; installed by scripts/setup_env.sh
-# with `pip install --no-deps`. opencv-python-headless takes the place of opencv-python, and gym-aloha comes without
-# its simulator. torch is locked by its public version: which build (CPU, CUDA) is decided at installation.
+# with `pip install --no-deps`. opencv-python-headless takes the place of opencv-python; gym-aloha comes without what it
+# asks for, the extra `aloha` has its simulator. torch is locked by its public version: which build (CPU, CUDA) is decided
+# at installation.
 """
 
 
@@ -38,7 +39,8 @@ def belongs_to_cuda(name: str) -> bool:
 def main() -> None:
     """Write requirements.lock beside pyproject.toml."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    wanted = [*project["dependencies"], *project["optional-dependencies"]["dev"], *BUILD]
+    extras = [item for group in project["optional-dependencies"].values() for item in group]
+    wanted = [*project["dependencies"], *(item for item in extras if not item.startswith(project["name"])), *BUILD]
     meshes_only = [item for item in wanted if item.startswith(WITHOUT_DEPENDENCIES)]
     versions = resolve([item for item in wanted if item not in meshes_only])
     versions |= dict(item.split("==") for item in meshes_only)
