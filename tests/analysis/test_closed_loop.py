@@ -76,6 +76,6 @@ def test_the_verdict_names_what_differs_or_how_much_may_be_hidden():
 
 
 def test_ways_are_named_in_words():
-    assert [budget_name(ratio, 0.3) for ratio in (0, 0.125, 0.3)] == ["nothing (coarse)", "12.5%", "30%, as trained"]
+    assert [budget_name(ratio, 0.3) for ratio in (0, 0.125, 0.3)] == ["0%, coarse policy", "12.5%", "30%, as trained"]
     assert execution_name("aggregate-variance") == "`aggregate-variance`: chunks aggregated with inverse variance"
     assert execution_name(25) == "`25`: 25 steps of each chunk"

@@ -34,14 +34,14 @@ def test_a_sweep_tries_budgets_and_executions_on_the_same_selection_seeds(comman
     said, folder = capsys.readouterr().out, tmp_path / "sweep-policy_best"
     page = (folder / "sweep.md").read_text()
     for text in (
-        "| nothing (coarse) | 0 |",
+        "| 0%, coarse policy | 0 |",
         "| 30%, as trained | 3 |",
         "10/10 = 100.0% | [72.2%, 100.0%] | 0 | +0.0% [-27.8%, +27.8%] | 0 / 0 |",
         "| 100% | 10 |",
         "| 0 / 10 | 0.00195 | 0.00586 |",
         "| `aggregate-variance`: chunks aggregated with inverse variance |",
-        "Success differs from that of nothing (coarse)",
-        "No execution can be told apart from `aggregate`",
+        "Success differs from that with 0%, coarse policy (10/10",
+        "No execution can be told apart from `aggregate` (10/10",
     ):
         assert text in page or text in said, text
     found = json.loads((folder / "sweep.json").read_text())

@@ -51,8 +51,8 @@ HEAD = ("success", "95 % interval", "crashed", "difference", "only here / only f
 def use_cells(use: Use) -> tuple[str, ...]:
     """What `HEAD` names, for one way."""
     total, against = use.total, use.against
-    cells = (f"{total.successes}/{total.n} = {total.rate:.1%}", f"[{total.low:.1%}, {total.high:.1%}]")
-    cells += (str(total.crashed),)
+    success = f"{total.successes}/{total.n} = {total.rate:.1%}"
+    cells = (success, f"[{total.low:.1%}, {total.high:.1%}]", str(total.crashed))
     if against is None:
         return (*cells, "", "", "", "")
     difference = f"{against.difference:+.1%} [{against.low:+.1%}, {against.high:+.1%}]"
@@ -89,20 +89,26 @@ def verdict(uses: Sequence[Use], what: str) -> str:
         what: what they are, such as `budget`.
     """
     first, *others = uses
+    start = f"{_short(first)} ({first.total})"
     differing = [use for use in others if use.p_holm < LEVEL]
     n = f"n = {first.total.n} seeds"
     if not others:
-        return f"There is only one {what}: {first.name}, {first.total}."
+        return f"There is only one {what}: {start}."
     if differing:
-        found = "; ".join(f"{use.name}: {use.against}, {use.p_holm:.3g} after correction" for use in differing)
-        return f"Success differs from that of {first.name} ({first.total}) for this checkpoint: {found}."
+        found = "; ".join(f"{_short(use)}: {use.against}, {use.p_holm:.3g} after correction" for use in differing)
+        return f"Success differs from that with {start} for this checkpoint: {found}."
     low = min(use.against.low for use in others if use.against)
     high = max(use.against.high for use in others if use.against)
     return (
-        f"No {what} can be told apart from {first.name} ({first.total}) on {n}: the smallest p is "
+        f"No {what} can be told apart from {start} on {n}: the smallest p is "
         f"{min(use.p_holm for use in others):.3g} after correction for {len(others)}, and differences from {low:+.0%} "
         f"to {high:+.0%} are compatible with these episodes."
     )
+
+
+def _short(use: Use) -> str:
+    """A name without its explanation."""
+    return use.name.partition(":")[0]
 
 
 def use_records(uses: Sequence[Use]) -> list[dict[str, Any]]:
@@ -125,7 +131,7 @@ def budget_name(ratio: float, trained: float | None) -> str:
         ratio: share of a chunk that is refined.
         trained: that of the training.
     """
-    name = "nothing (coarse)" if ratio == 0 else f"{100 * ratio:g}%"
+    name = "0%, coarse policy" if ratio == 0 else f"{100 * ratio:g}%"
     return f"{name}, as trained" if ratio == trained else name
 
 

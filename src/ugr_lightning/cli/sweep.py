@@ -10,7 +10,7 @@ from ugr_lightning.cli.runs import resolve_checkpoint
 from ugr_lightning.contract import ChunkPolicy, EpisodeResult
 from ugr_lightning.errors import ConfigError
 
-VARIANCE = "aggregate-variance"
+VARIANCE: Literal["aggregate-variance"] = "aggregate-variance"
 
 
 def run(command: str, argv: Sequence[str]) -> int:
@@ -99,7 +99,8 @@ def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[Executi
     tried: list[float] = sorted({0.0, trained, *wanted}) if wanted else []
     certain = _predicts_variance(policy, info.data.get("image_size"))
     first, *others = both_executions(checkpoint)
-    chosen = executions or [first, *([VARIANCE] if certain else []), *others]
+    weighted: list[ExecutionName] = [VARIANCE] if certain else []
+    chosen = executions or [first, *weighted, *others]
     for execution in chosen:
         make_execution(execution, policy.chunk_length)
     if VARIANCE in chosen and not certain:
@@ -159,8 +160,8 @@ def _closed_loop(
                 keep=simulators,
             )
 
-        modes = {execution_name(execution): act(None, execution) for execution in plan.executions}
-        budgets = {budget_name(ratio, plan.trained): act(ratio, plan.executions[0]) for ratio in plan.ratios}
+        modes: Episodes = {execution_name(execution): act(None, execution) for execution in plan.executions}
+        budgets: Episodes = {budget_name(ratio, plan.trained): act(ratio, plan.executions[0]) for ratio in plan.ratios}
     return budgets, modes
 
 
