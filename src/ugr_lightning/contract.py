@@ -132,7 +132,8 @@ class EpisodeResult:
         setting: scene setting, `demo_clean` or `demo_randomized`.
         seed: simulator seed.
         seeds_hash: SHA-256 of the seed list the episode belongs to.
-        policy: what acted: a checkpoint's policy class, or `zero`, `random`, `expert`.
+        policy: what acted: a checkpoint's policy class, with the budget where that was chosen, such as
+            `ACT(refine_ratio=0.5)`; or `zero`, `random`, `expert`.
         checkpoint: SHA-256 of the checkpoint file, or None.
         execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), or the number of steps executed
             of each chunk.
