@@ -12,7 +12,8 @@ from ugr_lightning.data.frames import MAX_PIXELS, FrameSource
 from ugr_lightning.data.hdf5 import MAX_COLUMNS
 from ugr_lightning.errors import ConfigError, DataError
 
-MAX_BYTES = 2**30  # of the columns that are loaded at a time
+MAX_BYTES = 2**27  # of numbers that are loaded at a time
+MAX_PICTURE_BYTES = 2**29  # of an episode's encoded pictures
 FIX = "Copy the dataset again, or leave this episode out."
 
 
@@ -60,26 +61,46 @@ def read_table(path: Path, columns: Sequence[str], rows: tuple[int, int] | None 
             if not 0 <= first <= last <= starts[-1]:
                 raise DataError(path, f"rows {first} to {last}", f"{starts[-1]} rows", FIX)
             groups = [i for i in range(file.num_row_groups) if starts[i] < last and starts[i + 1] > first]
-            _check_size(path, file.metadata, groups, columns)
-            table = file.read_row_groups(groups, columns=list(columns), use_threads=False)
             skipped = int(starts[groups[0]]) if groups else 0
-            return table.select(list(columns)).slice(first - skipped, last - first)
+            return _read_rows(file, path, groups, columns, first - skipped, last - first)
     except (pyarrow.ArrowException, OSError, ValueError, KeyError, TypeError, MemoryError) as error:
-        raise DataError(path, "a readable Parquet file", f"{type(error).__name__}: {error}"[:160], FIX) from error
+        got = " ".join(f"{type(error).__name__}: {error}".split())[:160]
+        raise DataError(path, "a readable Parquet file", got, FIX) from error
 
 
-def _check_size(path: Path, metadata: Any, groups: Sequence[int], columns: Sequence[str]) -> None:
-    size = 0
-    for group in map(metadata.row_group, groups):
-        parts = (group.column(i) for i in range(group.num_columns))
-        size += sum(part.total_uncompressed_size for part in parts if _belongs(part.path_in_schema, columns))
-    if size > MAX_BYTES:
-        raise DataError(path, f"at most {MAX_BYTES} bytes at a time", size, "Split the file.")
+def _read_rows(file: Any, path: Path, groups: Sequence[int], columns: Sequence[str], first: int, count: int) -> Any:
+    """Some rows of some row groups, decoded a few at a time, so that what is absurdly large is noticed early.
+
+    What the file says of the size of its columns would not do: equal rows are stored once. Nor may it be looked at:
+    pyarrow ends the process where that part of a file is damaged.
+    """
+    pyarrow = import_pyarrow()
+    schema = pyarrow.schema([file.schema_arrow.field(column) for column in columns])
+    wide = not all(_is_numeric(field.type) for field in schema)
+    most, kept, size, at = MAX_PICTURE_BYTES if wide else MAX_BYTES, [], 0, 0
+    options = {"batch_size": 4 if wide else 2**16, "columns": list(columns), "use_threads": False}
+    for batch in file.iter_batches(row_groups=list(groups), **options) if count else ():
+        start, end = max(0, first - at), min(len(batch), first + count - at)
+        at += len(batch)
+        if end <= start:
+            continue
+        kept.append(batch.select(list(columns)).slice(start, end - start))
+        size += kept[-1].nbytes
+        if size > most:
+            raise DataError(path, f"at most {most} bytes of {', '.join(columns)}"[:200], f"{size} and more", FIX)
+        if at >= first + count:
+            break
+    if sum(map(len, kept)) != count:
+        raise DataError(path, f"{count} rows from {first} on", sum(map(len, kept)), FIX)
+    return pyarrow.Table.from_batches(kept) if kept else schema.empty_table()
 
 
-def _belongs(schema_path: str, columns: Sequence[str]) -> bool:
-    """Whether a leaf of the schema, such as `action.list.element`, is part of one of the columns."""
-    return any(schema_path == column or schema_path.startswith(column + ".") for column in columns)
+def _is_numeric(kind: Any) -> bool:
+    """Whether a column holds numbers or lists of numbers."""
+    kinds = import_pyarrow().types
+    if kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
+        kind = kind.value_type
+    return bool(kinds.is_primitive(kind))
 
 
 def column_values(table: Any, column: str, path: Path) -> np.ndarray:

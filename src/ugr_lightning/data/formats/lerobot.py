@@ -5,6 +5,8 @@ action is the command of its own row. Needs the extra `lerobot` (pyarrow, av).
 """
 
 import json
+import re
+import string
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +30,9 @@ UPGRADE = (
 )
 MAX_JSON_BYTES = 2**24
 MAX_HZ = 10_000
+MAX_PATTERN = 300
+PLACES = ("video_key", "chunk_index", "file_index")
+WIDTH = re.compile(r"(0?\d{1,2})?d?")  # how a number in a file name is written, e.g. 03d
 
 
 class LeRobot(EpisodeFormat):
@@ -195,11 +200,18 @@ class _Info:
 
     def _file(self, pattern: str, chunk: float, number: float, key: str = "") -> Path:
         try:
+            fields = [(name, spec or "") for _, name, spec, _ in string.Formatter().parse(pattern) if name is not None]
+            if len(pattern) > MAX_PATTERN or not all(n in PLACES and WIDTH.fullmatch(spec) for n, spec in fields):
+                raise ValueError(pattern)
             name = pattern.format(video_key=key, chunk_index=int(chunk), file_index=int(number))
-        except (KeyError, IndexError, ValueError, AttributeError, MemoryError) as error:
+        except (KeyError, IndexError, ValueError, AttributeError) as error:
             raise DataError(self.root / INFO, "patterns of file names", f"{pattern!r}"[:120], FIX) from error
         path = self.root / name
-        if "\0" in name or len(name) > 1000 or not path.resolve().is_relative_to(self.root.resolve()):
+        try:
+            inside = "\0" not in name and len(name) <= 1000 and path.resolve().is_relative_to(self.root.resolve())
+        except (OSError, RuntimeError) as error:  # links in a circle
+            raise DataError(path, "a file of the dataset", str(error), FIX) from error
+        if not inside:
             raise DataError(self.root / INFO, "files inside the dataset", f"{name!r}"[:120], FIX)
         return path
 
