@@ -1,5 +1,6 @@
 """What is unusual about demonstrations: each function looks for one thing and says it in one line, or nothing."""
 
+import itertools
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -11,7 +12,7 @@ from ugr_lightning.contract import STATE_DIM
 from ugr_lightning.data.inspection import Inspection, Seen, fits_swapped
 
 STILL = 1e-4  # a joint that moves less than this in all episodes is constant, in its own units
-JUMP_OF_RANGE, JUMP_OF_USUAL = 0.3, 8.0  # of a joint's range, and times what 99 % of its steps stay below
+JUMP_OF_RANGE, JUMP_OF_USUAL, USUAL = 0.3, 8.0, 0.9  # of a joint's range; times what so many of its steps stay below
 GRIPPERS = (6, 13)  # where the joint vector is ours and the file gives no names
 
 
@@ -51,9 +52,10 @@ def shorten(values: Sequence[object], most: int = 8) -> str:
 
 def _numbering(found: Inspection) -> Iterable[str]:
     present = list(found.present)
-    missing = sorted(set(range(present[0], present[-1] + 1)) - set(present))
-    if missing:
-        yield f"numbers without an episode: {shorten(missing)}"
+    gaps = [(one + 1, other - 1) for one, other in itertools.pairwise(present) if other - one > 1]
+    if gaps:
+        words = [str(first) if first == last else f"{first} to {last}" for first, last in gaps]
+        yield f"numbers without an episode: {shorten(words)}"
 
 
 def _unfinished(folder: Path) -> Iterable[str]:
@@ -126,7 +128,7 @@ def _jumps(found: Inspection) -> Iterable[str]:
         every = np.concatenate(steps)
         if not len(every):
             continue
-        usual, span = np.quantile(every, 0.99, axis=0), np.ptp(np.concatenate(rows), axis=0)
+        usual, span = np.quantile(every, USUAL, axis=0), np.ptp(np.concatenate(rows), axis=0)
         limit = np.maximum(np.maximum(JUMP_OF_RANGE * span, JUMP_OF_USUAL * usual), STILL)  # (D,)
         limit[gripper_columns(names)] = np.inf  # commanded to open and close at once
         where = [

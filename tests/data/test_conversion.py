@@ -1,0 +1,243 @@
+"""Conversions lose nothing that they promise to keep, and leave whole episodes only wherever they are stopped."""
+
+import os
+import shutil
+
+import numpy as np
+import pytest
+
+from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data import folder as folders
+from ugr_lightning.data.conversion import NOTE, convert, left_out
+from ugr_lightning.data.formats import detect, find_format, formats
+from ugr_lightning.data.layout import Joint, Layout
+from ugr_lightning.errors import ConfigError, DataError
+
+WRITTEN = [form.name for form in formats() if form.writable]
+
+
+def skip_without_extra(name):
+    if name == "lerobot":
+        pytest.importorskip("av", reason="the extra `lerobot` is not installed")
+        pytest.importorskip("pyarrow", reason="the extra `lerobot` is not installed")
+
+
+def read_all(folder):
+    form = detect(folder)
+    return [form.read(location, CAMERAS) for location in form.find(folder).values()]
+
+
+def content(folder):
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+@pytest.fixture(scope="module")
+def recording(record, tmp_path_factory):
+    """Three recordings of 5, 8 and 11 steps; not to be changed."""
+    return record(tmp_path_factory.mktemp("source"), count=3, steps=5)
+
+
+def test_the_formats_that_can_be_written_are_known():
+    assert WRITTEN == ["act", "lerobot", "original-act", "robotwin"]
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_states_and_actions_are_exact_and_pictures_within_the_codecs_bound(name, recording, tmp_path):
+    skip_without_extra(name)
+    before = content(recording)
+    said = []
+    given = convert(recording, tmp_path / "out", name, done=lambda *progress: said.append(progress))
+    assert detect(tmp_path / "out").name == name
+    for one, other in zip(given, read_all(tmp_path / "out"), strict=True):
+        assert np.array_equal(one.state, other.state)
+        assert np.array_equal(one.action, other.action)
+        for step in range(one.length):
+            error = np.abs(one.images(step).astype(int) - other.images(step))
+            assert error.mean() <= 4 if name == "lerobot" else error.max() == 0
+    assert said == [(what, number, 3) for what in ("reading", "writing", "checking") for number in (1, 2, 3)]
+    assert not list((tmp_path / "out").rglob("*.partial"))
+    assert content(recording) == before
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_there_and_back_is_exact(name, recording, tmp_path):
+    skip_without_extra(name)
+    convert(recording, tmp_path / "there", name)
+    convert(tmp_path / "there", tmp_path / "back", "robotwin")
+    for one, other in zip(read_all(recording), read_all(tmp_path / "back"), strict=True):
+        assert np.array_equal(one.state, other.state)
+        assert np.array_equal(one.action, other.action)
+        if name in ("act", "robotwin"):
+            assert [one.frames.jpegs(t) for t in range(one.length)] == [
+                other.frames.jpegs(t) for t in range(one.length)
+            ]
+
+
+def _stop_at(monkeypatch, call):
+    """Ends the conversion at the given rename, as a loss of power would: nothing is tidied up."""
+    count = 0
+    rename = os.replace
+
+    def stopping(source, target):
+        nonlocal count
+        count += 1
+        if count == call:
+            raise KeyboardInterrupt
+        rename(source, target)
+
+    monkeypatch.setattr(folders.os, "replace", stopping)
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_stopped_anywhere_it_leaves_whole_episodes_and_goes_on_to_the_same_result(
+    name, recording, tmp_path, monkeypatch
+):
+    skip_without_extra(name)
+    whole = convert(recording, tmp_path / "whole", name)
+    expected = content(tmp_path / "whole")
+    renames = len(expected)
+    assert renames >= 4
+    for call in range(1, renames + 1) if name != "lerobot" else (1, 5, renames):
+        out = tmp_path / f"stopped {call}"
+        with monkeypatch.context() as patch:
+            _stop_at(patch, call)
+            with pytest.raises(KeyboardInterrupt):
+                convert(recording, out, name)
+        there = {path: data for path, data in content(out).items() if not path.endswith(".partial")}
+        assert len(there) == call - 1
+        assert all(expected[path] == data for path, data in there.items())
+        times = {path: (out / path).stat().st_mtime_ns for path in there if path != NOTE}
+        assert len(convert(recording, out, name)) == len(whole)
+        assert content(out) == expected
+        kept = {path for path, then in times.items() if (out / path).stat().st_mtime_ns == then}
+        assert kept >= {path for path in times if path.endswith(".hdf5")}
+
+
+def test_a_finished_conversion_is_left_as_it_is(recording, tmp_path):
+    convert(recording, tmp_path / "out", "act")
+    before = {path: path.stat().st_mtime_ns for path in (tmp_path / "out").glob("*.hdf5")}
+    convert(recording, tmp_path / "out", "act")
+    assert {path: path.stat().st_mtime_ns for path in before} == before
+
+
+def _something(folder):
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+
+
+def _other_format(folder):
+    convert(_source(folder), folder, "original-act")
+
+
+def _other_cameras(folder):
+    convert(_source(folder), folder, "act", cameras=("cam_high",))
+
+
+def _fewer(folder):
+    convert(_source(folder), folder, "act", episodes=2)
+
+
+def _other_note(folder):
+    folder.mkdir()
+    (folder / NOTE).write_text("[1]")
+
+
+def _file(folder):
+    folder.write_text("mine")
+
+
+def _source(folder):
+    return folder.parent / "source"
+
+
+OTHERS = {
+    "something else": (_something, r"an empty folder.*notes\.txt"),
+    "another format": (_other_format, "one with other to"),
+    "other cameras": (_other_cameras, "one with other cameras and sha256|one with other cameras"),
+    "fewer episodes": (_fewer, "one with other episodes"),
+    "another note": (_other_note, "the note of a conversion"),
+    "a file": (_file, "a folder, got the file"),
+}
+
+
+@pytest.mark.parametrize("case", OTHERS)
+def test_a_folder_with_something_else_is_refused_and_left_alone(case, recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "source")
+    make, message = OTHERS[case]
+    make(tmp_path / "out")
+    before = content(tmp_path)
+    with pytest.raises((ConfigError, DataError), match=message):
+        convert(tmp_path / "source", tmp_path / "out", "act")
+    assert content(tmp_path) == before
+
+
+def test_the_source_is_no_target_and_a_changed_source_is_another_conversion(recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "source")
+    with pytest.raises(ConfigError, match="another folder than the source"):
+        convert(tmp_path / "source", tmp_path / "source" / ".", "act")
+    convert(tmp_path / "source", tmp_path / "out", "act")
+    shutil.move(tmp_path / "source", tmp_path / "moved")
+    convert(tmp_path / "moved", tmp_path / "out", "act")
+    shutil.copy(tmp_path / "moved/data/episode1.hdf5", tmp_path / "moved/data/episode0.hdf5")
+    with pytest.raises(DataError, match="sha256"):
+        convert(tmp_path / "moved", tmp_path / "out", "act")
+
+
+def test_a_damaged_episode_is_found_before_anything_is_written(recording, tmp_path):
+    shutil.copytree(recording, tmp_path / "source")
+    (tmp_path / "source/data/episode2.hdf5").write_bytes(b"nothing")
+    with pytest.raises(DataError, match=r"episode2\.hdf5"):
+        convert(tmp_path / "source", tmp_path / "out", "act")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_full_disk_is_an_error_of_ours_and_the_next_run_goes_on(recording, tmp_path, monkeypatch):
+    def full(path, write):
+        if path.name == "episode_1.hdf5":
+            raise OSError(28, "No space left on device")
+        folders.publish(path, write)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("ugr_lightning.data.formats.publish", full)
+        with pytest.raises(DataError, match=r"No space left.*the same command goes on"):
+            convert(recording, tmp_path / "out", "act")
+    assert len(convert(recording, tmp_path / "out", "act")) == len(list((tmp_path / "out").glob("*.hdf5"))) == 3
+
+
+def test_numbers_that_do_not_come_back_are_noticed(recording, tmp_path, monkeypatch):
+    form = find_format("act")
+    write = type(form).fill
+
+    def wrong(self, file, episode):
+        write(self, file, episode)
+        file["action"][0, 0] += 1e-6
+
+    monkeypatch.setattr(type(form), "fill", wrong)
+    with pytest.raises(DataError, match="other numbers"):
+        convert(recording, tmp_path / "out", "act")
+
+
+def test_formats_that_are_only_read_and_unknown_ones_are_refused(recording, tmp_path):
+    for name in ("xpolicylab", "maniskill", "zarr"):
+        with pytest.raises(ConfigError, match=r"act, .*robotwin"):
+            convert(recording, tmp_path / "out", name)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_layout_cameras_and_a_rate_are_written(recording, tmp_path):
+    layout = Layout(state=("left_joint_1", Joint("left_gripper", scale=2.0)), action=(13,))
+    options = {"cameras": ("cam_left_wrist",), "layout": layout, "episodes": 2, "rate": 10}
+    (first, _) = convert(recording, tmp_path / "out", "original-act", **options)
+    form = find_format("original-act")
+    contents = form.peek(form.find(tmp_path / "out")[0])
+    assert (contents.cameras, len(contents.state), len(contents.action)) == (("cam_left_wrist",), 2, 1)
+    source = read_all(recording)[0]
+    back = form.read(form.find(tmp_path / "out")[0], contents.cameras, contents.layout)
+    assert np.array_equal(back.action[:, 0], source.action[:, 13])
+    assert np.allclose(back.state[:, 1], 2 * source.state[:, 6])
+    assert np.allclose(back.extras["qvel"][1:], np.diff(first.measured, axis=0) * 10)
+
+
+def test_what_has_no_place_in_the_target_is_told(recording, tmp_path):
+    episodes = convert(recording, tmp_path / "out", "act")
+    assert left_out(find_format("act"), tmp_path / "out", episodes) == ["contacts", "measured", "phase", "slack"]
