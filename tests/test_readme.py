@@ -60,6 +60,7 @@ def ugr_commands() -> list[str]:
         page = read(path)
         found += [line for line in command_lines(page) if re.match(r"ugr( |$)", line)]
         found += [span for span in page.spans if re.match(r"ugr \w+ .", span) and not re.search(r"\.\.\.|…", span)]
+    found = [f"{line} --help" if re.fullmatch(r"ugr (data|bridge) \w+", line) else line for line in found]
     return list(dict.fromkeys(re.sub(r"\s+#.*", "", line) for line in found))
 
 
@@ -95,10 +96,12 @@ def test_every_subcommand_and_flag_of_the_text_is_known(page, monkeypatch, capsy
     flags = {flag for span in spans if span.startswith("--") for flag in re.findall(r"--[\w.]+", span)}
     if flags:
         options = ""
-        for command in main.COMMANDS:
+        commands = [[command] for command in main.COMMANDS]
+        for command in commands:
             with pytest.raises(SystemExit):
-                main.main([command, "--help"])
-            options += capsys.readouterr().out
+                main.main([*command, "--help"])
+            options += (shown := capsys.readouterr().out)
+            commands += [[*command, name] for name in re.findall(rf"^  ugr {command[0]} (\w+)  ", shown, re.MULTILINE)]
         assert flags <= set(re.findall(r"--[\w.]+", options))
 
 

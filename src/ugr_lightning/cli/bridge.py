@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-from ugr_lightning.cli.call import call
+from ugr_lightning.cli.call import call_one_of
 from ugr_lightning.cli.rollout import ExecutionName
 from ugr_lightning.errors import ConfigError
 
@@ -104,16 +104,13 @@ def _serve(
     return 0
 
 
-FUNCTIONS: dict[str, Callable[..., int]] = {"robotwin": _robotwin, "xpolicylab": _xpolicylab, "serve": _serve}
+FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
+    "robotwin": (_robotwin, ("ckpt",)),
+    "xpolicylab": (_xpolicylab, ("ckpt",)),
+    "serve": (_serve, ()),
+}
 
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr bridge NAME`."""
-    if argv and argv[0] in ("-h", "--help"):
-        about = [f"  {name:<12}{(part.__doc__ or '').splitlines()[0]}" for name, part in FUNCTIONS.items()]
-        print("\n".join(["usage: ugr bridge NAME [options]; `ugr bridge NAME --help` lists them.", *about]))
-        raise SystemExit(0)
-    if not argv or argv[0] not in FUNCTIONS:
-        got = argv[0] if argv else "nothing"
-        raise ConfigError("ugr bridge", f"one of {', '.join(FUNCTIONS)}", got, "`ugr bridge --help` explains them.")
-    return call(FUNCTIONS[argv[0]], f"{command} {argv[0]}", argv[1:])
+    return call_one_of(FUNCTIONS, command, argv)

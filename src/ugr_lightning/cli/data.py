@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ugr_lightning.cli.call import call, name_leading
+from ugr_lightning.cli.call import call_one_of
 from ugr_lightning.contract import CHUNK_LENGTH
 from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import ConfigError, DataError
@@ -226,11 +226,4 @@ FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr data inspect` or `ugr data convert`."""
-    if not argv or argv[0] not in FUNCTIONS:
-        if argv and argv[0] in ("-h", "--help"):
-            print("usage: ugr data inspect PATH\n       ugr data convert FROM TO --to FORMAT\n(`--help` behind each)")
-            return 0
-        got = argv[0] if argv else "nothing"
-        raise ConfigError("ugr data", f"one of {', '.join(FUNCTIONS)}", got, "`ugr data --help` lists them.")
-    function, leading = FUNCTIONS[argv[0]]
-    return call(function, f"{command} {argv[0]}", name_leading(argv[1:], leading))
+    return call_one_of(FUNCTIONS, command, argv)

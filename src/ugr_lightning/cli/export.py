@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
 
-from ugr_lightning.cli.call import call, name_leading
+from ugr_lightning.cli.call import call
 
 
 def _export(
@@ -47,4 +47,4 @@ def _export(
 
 def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr export`."""
-    return call(_export, command, name_leading(argv, ["ckpt"]))
+    return call(_export, command, argv, ["ckpt"])

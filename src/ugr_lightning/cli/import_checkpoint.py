@@ -4,7 +4,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ugr_lightning.cli.call import call, name_leading
+from ugr_lightning.cli.call import call
 from ugr_lightning.contract import CAMERAS
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.precision import Precision
@@ -116,4 +116,4 @@ FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
 def run(command: str, argv: Sequence[str]) -> int:
     """Run one of the subcommands above."""
     function, leading = FUNCTIONS[command]
-    return call(function, command, name_leading(argv, leading))
+    return call(function, command, argv, leading)

@@ -14,9 +14,7 @@ def run(command: str, argv: Sequence[str]) -> int:
     """Run `ugr inspect`."""
     from ugr_lightning.cli.call import call
 
-    if argv and not argv[0].startswith("-"):  # `ugr inspect PATH`
-        argv = ["--path", *argv]
-    return call(_inspect, command, argv)
+    return call(_inspect, command, argv, ["path"])
 
 
 def _inspect(path: str, picture: str | None = None) -> int:
