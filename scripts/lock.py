@@ -15,8 +15,8 @@ WITHOUT_DEPENDENCIES = ("gym-aloha",)
 REPLACED = {"opencv-python": "opencv-python-headless"}
 HEADER = """\
 # Every package of the environment at its exact version. Written by `make lock`; installed by scripts/setup_env.sh
-# with `pip install --no-deps`. opencv-python-headless takes the place of opencv-python; what gym-aloha's simulator needs
-# is the extra `aloha`. torch is locked by its public version: which build (CPU, CUDA) is decided at installation.
+# with `pip install --no-deps`. opencv-python-headless takes the place of opencv-python; what gym-aloha's simulator
+# needs is the extra `aloha`. torch is locked by its public version: which build (CPU, CUDA) is decided at installation.
 """
 
 
