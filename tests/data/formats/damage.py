@@ -308,4 +308,4 @@ DOCUMENTS = {
     "a pickle": CODE,
     "an object without anything": b"{}",
 }
-VALUES = (None, True, -1, 1e999, float("nan"), 10**30, "text", "{0.__class__}", [], [[[]]], {}, {"a": {"b": []}})
+VALUES = (None, -1, 1e999, 10**30, "text", "{0.__class__}", [[]], {"a": {"b": []}})

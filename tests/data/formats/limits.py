@@ -19,7 +19,7 @@ PATIENCE_S = 60.0  # of the clock, for a child that waits instead of working
 
 
 def read_demonstrations(path):
-    """Everything that `ugr fit` and `ugr data inspect` would read of a folder; returns the first complaint."""
+    """What `ugr fit` and `ugr data inspect` read of the first episodes of a folder; returns the first complaint."""
     from ugr_lightning.contract import CAMERAS
     from ugr_lightning.data.formats import detect
     from ugr_lightning.data.inspection import inspect_demonstrations
@@ -32,12 +32,12 @@ def read_demonstrations(path):
     try:
         cameras = [camera for camera in form.peek(location).cameras if camera in CAMERAS]
         episode = form.read(location, cameras or form.peek(location).cameras)
-        for step in range(min(episode.length, 200)):
+        for step in {0, 2, episode.length - 1} & set(range(episode.length)):
             episode.images(step)
             episode.frames.jpegs(step)
     except UGRError as error:
         complaint = error
-    found = inspect_demonstrations(path)
+    found = inspect_demonstrations(path, episodes=2)
     find_oddities(found, 50)
     return complaint or next(iter(found.unreadable.values()), None)
 
@@ -63,6 +63,13 @@ def _fail_for_memory(path):
         raise DataError(path, "memory", "none", "Buy some.") from error
 
 
+def _run_pickle(path):
+    there = os.getcwd()
+    os.chdir(path)
+    pickle.loads((path / "dataset_stats.pkl").read_bytes())
+    os.chdir(there)
+
+
 USES = {
     "demonstrations": read_demonstrations,
     "statistics": read_statistics,
@@ -71,7 +78,7 @@ USES = {
     "memory": lambda path: bytearray(2 * BYTES),
     "hidden memory": _fail_for_memory,
     "crash": lambda path: os.abort(),
-    "pickle": lambda path: pickle.loads((path / "dataset_stats.pkl").read_bytes()),
+    "pickle": _run_pickle,
     "nothing": lambda path: None,
 }
 
