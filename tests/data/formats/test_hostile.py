@@ -7,6 +7,7 @@ limits (`limits.py`).
 import collections
 import functools
 import hashlib
+import importlib.util
 import io
 import json
 import os
@@ -16,21 +17,27 @@ import subprocess
 import sys
 from pathlib import Path
 
-import damage
 import h5py
-import limits
 import numpy as np
 import pytest
-import test_act
-import test_maniskill
-import test_robotwin
-import test_xpolicylab
 
 from ugr_lightning.data.formats import formats
 
 pytest.importorskip("av", reason="the extra `lerobot` is not installed")
 pyarrow = pytest.importorskip("pyarrow", reason="the extra `lerobot` is not installed")
-import test_lerobot  # noqa: E402
+
+
+def _beside(name):
+    """A module of this folder; another folder's may have the same name."""
+    spec = importlib.util.spec_from_file_location(f"beside_hostile_{name}", Path(__file__).with_name(f"{name}.py"))
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+damage, limits = _beside("damage"), _beside("limits")
+test_act, test_lerobot, test_maniskill = _beside("test_act"), _beside("test_lerobot"), _beside("test_maniskill")
+test_robotwin, test_xpolicylab = _beside("test_robotwin"), _beside("test_xpolicylab")
 
 FEWEST = 30  # cases of each reader
 LEROBOT_EPISODES, LEROBOT_DATA = test_lerobot.EPISODES, test_lerobot.DATA
