@@ -86,8 +86,9 @@ def _describe(found: "Inspection", chunk_length: int) -> list[str]:
 
 
 def _rate(found: "Inspection") -> str:
-    rates = sorted({one.episode.extras.get("control_hz") for one in found.seen} - {None})
-    frequencies = sorted({one.episode.extras.get("frequency") for one in found.seen} - {None})
+    extras = [one.episode.extras for one in found.seen]
+    rates = sorted({extra["control_hz"] for extra in extras if extra.get("control_hz") is not None})
+    frequencies = sorted({extra["frequency"] for extra in extras if extra.get("frequency") is not None})
     words = [", ".join(f"{rate:g}" for rate in rates) + " steps per second"] if rates else ["not stated"]
     if frequencies:
         words.append(f"`frequency` {', '.join(map(str, frequencies))}: simulation steps between frames, if RoboTwin's")

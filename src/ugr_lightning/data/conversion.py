@@ -63,7 +63,7 @@ def convert(
     note = _describe(found, source, to)
     _check_note(target, note)
     try:
-        publish(target / NOTE, lambda partial: partial.write_text(json.dumps(note, indent=2) + "\n") and None)
+        publish(target / NOTE, lambda partial: _write_note(partial, note))
         form.write(target, found, lambda index: done("writing", index + 1, len(found)))
         _check_written(form, target, found, done)
     except OSError as error:
@@ -125,6 +125,10 @@ def _describe(episodes: Sequence[Episode], source: Path, to: str) -> dict[str, A
         "episodes": [episode.name for episode in episodes],
         "sha256": digest.hexdigest(),
     }
+
+
+def _write_note(path: Path, note: dict[str, Any]) -> None:
+    path.write_text(json.dumps(note, indent=2) + "\n")
 
 
 def _check_note(target: Path, note: dict[str, Any]) -> None:

@@ -41,7 +41,8 @@ class View(NamedTuple):
     shown: tuple[np.ndarray, ...]
 
 
-class Seen(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class Seen:
     """One readable episode.
 
     Args:
@@ -255,7 +256,8 @@ def measure_alignment(states: Sequence[np.ndarray], actions: Sequence[np.ndarray
             sums[lag] += float(np.abs(action[rows].astype(np.float64) - state[rows + lag]).sum())
             numbers[lag] += len(rows) * state.shape[1]
     means = tuple(float(total / number) for total, number in zip(sums, numbers, strict=True) if number)
-    return Alignment(*map(int, counts), means)
+    moving, is_state, is_next_state = map(int, counts)
+    return Alignment(moving, is_state, is_next_state, means)
 
 
 def _differs(one: np.ndarray, other: np.ndarray) -> np.ndarray:
