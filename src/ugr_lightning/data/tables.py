@@ -13,6 +13,7 @@ from ugr_lightning.data.hdf5 import MAX_COLUMNS
 from ugr_lightning.errors import ConfigError, DataError
 
 MAX_BYTES = 2**27  # of numbers that are loaded at a time
+MANY = 2**16  # rows of numbers that are decoded at a time
 MAX_PICTURE_BYTES = 2**29  # of an episode's encoded pictures
 FIX = "Copy the dataset again, or leave this episode out."
 
@@ -76,9 +77,9 @@ def _read_rows(file: Any, path: Path, groups: Sequence[int], columns: Sequence[s
     """
     pyarrow = import_pyarrow()
     schema = pyarrow.schema([file.schema_arrow.field(column) for column in columns])
-    wide = not all(_is_numeric(field.type) for field in schema)
-    most, kept, size, at = MAX_PICTURE_BYTES if wide else MAX_BYTES, [], 0, 0
-    options = {"batch_size": 4 if wide else 2**16, "columns": list(columns), "use_threads": False}
+    rows = min(_rows_at_once(field.type) for field in schema)
+    most, kept, size, at = MAX_PICTURE_BYTES if rows < MANY else MAX_BYTES, [], 0, 0
+    options = {"batch_size": rows, "columns": list(columns), "use_threads": False}
     for batch in file.iter_batches(row_groups=list(groups), **options) if count else ():
         start, end = max(0, first - at), min(len(batch), first + count - at)
         at += len(batch)
@@ -95,12 +96,14 @@ def _read_rows(file: Any, path: Path, groups: Sequence[int], columns: Sequence[s
     return pyarrow.Table.from_batches(kept) if kept else schema.empty_table()
 
 
-def _is_numeric(kind: Any) -> bool:
-    """Whether a column holds numbers or lists of numbers."""
+def _rows_at_once(kind: Any) -> int:
+    """How many rows of a column may be decoded together: numbers and lists of them, texts, or pictures."""
     kinds = import_pyarrow().types
+    if kinds.is_struct(kind) or kinds.is_binary(kind) or kinds.is_large_binary(kind):
+        return 4
     if kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
         kind = kind.value_type
-    return bool(kinds.is_primitive(kind))
+    return MANY if kinds.is_primitive(kind) else 64
 
 
 def column_values(table: Any, column: str, path: Path) -> np.ndarray:
