@@ -138,6 +138,7 @@ def _statistics(found: "Inspection") -> list[str]:
         values = np.concatenate(rows).astype(np.float64)  # (N, D)
         steps = np.concatenate([np.zeros((1, values.shape[1])), *(np.abs(np.diff(one, axis=0)) for one in rows)])
         table = np.stack([values.min(0), values.max(0), values.mean(0), values.std(0), steps.max(0)], axis=1)  # (D, 5)
+        table = table.round(6) + 0.0  # -0 and rounding errors are 0
         width = max(16, *(len(name) for name in names))
         heads = "".join(f"{head:>10}" for head in ("lowest", "highest", "mean", "std", "fastest"))
         lines.append(f"{vector:<{width}}  {heads}  ({len(names)} columns; fastest: largest change in a step)")
