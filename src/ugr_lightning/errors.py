@@ -45,3 +45,15 @@ class NumericsError(UGRError):
 
 class ProtocolError(UGRError):
     """An observation or a message of another program that does not keep to the agreed form."""
+
+
+def missing_extra(where: object, extra: str, cause: ImportError) -> ConfigError:
+    """The error for a package that only some users need.
+
+    Args:
+        where: what needs it.
+        extra: the group of pyproject.toml that brings it.
+        cause: what the import said.
+    """
+    fix = f"Install them with `pip install 'ugr-lightning[{extra}]'`."
+    return ConfigError(where, f"the packages of the extra `{extra}`", f"none ({cause})", fix)

@@ -4,9 +4,10 @@ import json
 import os
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from importlib.resources import files
 from pathlib import Path
+from typing import Any
 
 from ugr_lightning.errors import ConfigError
 
@@ -47,19 +48,44 @@ def write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Pa
     return list(contents)
 
 
-def place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping[str, str], copy: bool) -> list[Path]:
-    """Write a folder that knows where its checkpoint is: `@CHECKPOINT@` in the template.
+def write_policy_folder(
+    template: str,
+    load: Callable[[dict[str, Any]], Any],
+    checkpoint: Path,
+    out: Path,
+    *,
+    execution: str | int = "aggregate",
+    cameras: Mapping[str, str] | None = None,
+    copy: bool = False,
+) -> list[Path]:
+    """Write a policy folder for another program, after loading the checkpoint as that program will.
 
     Args:
         template: see `write_folder`.
-        checkpoint: the file, or the folder of `ugr export --to safetensors`.
-        out: see `write_folder`.
-        values: see `write_folder`.
+        load: makes the model from the folder's settings; it has a `deployment`.
+        checkpoint: file from `ugr fit`, or the folder of `ugr export --to safetensors`.
+        out: the folder, `policy/NAME` of a checkout of the other program.
+        execution: see `Deployment`.
+        cameras: the other program's names of the policy's cameras, where they differ from the usual ones.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
 
     Returns:
         The files written.
+
+    Raises:
+        ConfigError: the folder holds something else, or its name cannot be imported.
+        CheckpointError: the checkpoint cannot be evaluated.
     """
+    require_module_name(out)
+    settings = {"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": dict(cameras or {})}
+    used = load(settings).deployment.cameras
+    named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in used.items())
+    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
+    return _place_checkpoint(template, checkpoint, out, values, copy)
+
+
+def _place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping[str, str], copy: bool) -> list[Path]:
+    """Write a folder that knows where its checkpoint is: `@CHECKPOINT@` in the template."""
     place = out / (checkpoint.name if checkpoint.is_dir() else "policy_best.ckpt") if copy else checkpoint.resolve()
     named = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
     written = write_folder(template, out, {**values, "CHECKPOINT": named})

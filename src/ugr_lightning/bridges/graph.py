@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ugr_lightning.contract import ChunkPolicy, Observation
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.errors import ConfigError, missing_extra
 from ugr_lightning.models.diffusion import DiffusionPolicy
 
 Graph = Callable[[Tensor, Tensor], Tensor]
@@ -122,8 +122,7 @@ def require_onnx() -> None:
         import onnxruntime  # noqa: F401
         import onnxscript  # noqa: F401
     except ImportError as error:
-        fix = "Install them with `pip install ugr-lightning[onnx]`."
-        raise ConfigError("--to onnx", "the packages onnx, onnxscript and onnxruntime", error, fix) from error
+        raise missing_extra("--to onnx", "onnx", error) from error
 
 
 def _trace(policy: ChunkPolicy, observation: Observation) -> torch.export.ExportedProgram:

@@ -1,6 +1,5 @@
 """RoboTwin 2.0's policy interface: what the folder written by `ugr bridge robotwin` calls (FACTS 7.1)."""
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -8,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.bridges.deployment import Deployment
-from ugr_lightning.bridges.folder import place_checkpoint, require_module_name
+from ugr_lightning.bridges.folder import write_policy_folder
 from ugr_lightning.bridges.settings import choose_execution, number, shape, switch, text
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
 
@@ -121,35 +120,9 @@ def reset_model(model: Model) -> None:
     model.reset_model()
 
 
-def write_policy(
-    checkpoint: Path,
-    out: Path,
-    *,
-    execution: str | int = "aggregate",
-    cameras: Mapping[str, str] | None = None,
-    copy: bool = False,
-) -> list[Path]:
-    """Write a policy folder for RoboTwin, after loading the checkpoint as RoboTwin will.
-
-    Args:
-        checkpoint: file from `ugr fit`.
-        out: the folder, `policy/<Name>` of a RoboTwin checkout.
-        execution: see `Deployment`.
-        cameras: RoboTwin's names of the policy's cameras, where they differ from the usual ones.
-        copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
-
-    Returns:
-        The files written.
-
-    Raises:
-        ConfigError: the folder holds something else, or its name cannot be imported.
-        CheckpointError: the checkpoint cannot be evaluated.
-    """
-    require_module_name(out)
-    model = get_model({"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": cameras})
-    named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in model.deployment.cameras.items())
-    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
-    return place_checkpoint("robotwin", checkpoint, out, values, copy)
+def write_policy(checkpoint: Path, out: Path, **options: Any) -> list[Path]:
+    """Write a policy folder for RoboTwin; the options are those of `write_policy_folder`."""
+    return write_policy_folder("robotwin", get_model, checkpoint, out, **options)
 
 
 def _cameras(given: Any) -> dict[str, str]:

@@ -140,10 +140,10 @@ def _statistics(found: "Inspection") -> list[str]:
         table = np.stack([values.min(0), values.max(0), values.mean(0), values.std(0), steps.max(0)], axis=1)  # (D, 5)
         table = table.round(6) + 0.0  # -0 and rounding errors are 0
         width = max(16, *(len(name) for name in names))
-        heads = "".join(f"{head:>10}" for head in ("lowest", "highest", "mean", "std", "fastest"))
+        heads = "".join(f"{head:>11}" for head in ("lowest", "highest", "mean", "std", "fastest"))
         lines.append(f"{vector:<{width}}  {heads}  ({len(names)} columns; fastest: largest change in a step)")
         lines += [
-            f"  {name:<{width}}{''.join(f'{number:>10.4g}' for number in row)}"
+            f"  {name:<{width}}{''.join(f'{number:>11.4g}' for number in row)}"
             for name, row in zip(names, table, strict=True)
         ]
     return lines

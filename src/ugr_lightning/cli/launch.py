@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.errors import ConfigError, missing_extra
 
 
 def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str, Any]) -> int:
@@ -26,9 +26,8 @@ def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str
     """
     try:
         import submitit
-    except ImportError:
-        fix = "Install it (`pip install submitit`), or run single jobs with --job in a launcher of your own."
-        raise ConfigError("--launcher submitit", "the package submitit", "none", fix) from None
+    except ImportError as error:
+        raise missing_extra("--launcher submitit", "cluster", error) from error
     if not commands:
         print("Nothing is left to do.")
         return 0

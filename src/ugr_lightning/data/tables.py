@@ -10,7 +10,7 @@ from PIL import Image
 
 from ugr_lightning.data.frames import MAX_PIXELS, FrameSource
 from ugr_lightning.data.hdf5 import MAX_COLUMNS
-from ugr_lightning.errors import ConfigError, DataError
+from ugr_lightning.errors import DataError, missing_extra
 
 MAX_BYTES = 2**27  # of numbers that are loaded at a time
 MANY = 2**16  # rows of numbers that are decoded at a time
@@ -28,8 +28,7 @@ def import_pyarrow() -> Any:
         import pyarrow
         import pyarrow.parquet
     except ImportError as error:
-        fix = "Install it with `pip install 'ugr-lightning[lerobot]'`."
-        raise ConfigError("Parquet files", "the package `pyarrow`", f"none ({error})", fix) from error
+        raise missing_extra("Parquet files", "lerobot", error) from error
     return pyarrow
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ugr_lightning.data.frames import MAX_PIXELS, FrameSource
-from ugr_lightning.errors import ConfigError, DataError
+from ugr_lightning.errors import DataError, missing_extra
 
 FIX = "Copy the dataset again, or leave this episode out."
 ENCODING = {"preset": "veryfast", "crf": "18", "g": "2", "bf": "0"}
@@ -26,8 +26,7 @@ def import_av() -> Any:
     try:
         import av
     except ImportError as error:
-        fix = "Install it with `pip install 'ugr-lightning[lerobot]'`."
-        raise ConfigError("video files", "the package `av`", f"none ({error})", fix) from error
+        raise missing_extra("video files", "lerobot", error) from error
     return av
 
 

@@ -1,47 +1,19 @@
 """The adapter folder that XPolicyLab's scripts expect (FACTS 7.2)."""
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import yaml
 
-from ugr_lightning.bridges.folder import place_checkpoint, require_module_name
+from ugr_lightning.bridges.folder import write_policy_folder
 from ugr_lightning.bridges.xpolicylab.model import Model
 from ugr_lightning.errors import ConfigError
 
 
-def write_adapter(
-    checkpoint: Path,
-    out: Path,
-    *,
-    execution: str | int = "aggregate",
-    cameras: Mapping[str, str] | None = None,
-    copy: bool = False,
-) -> list[Path]:
-    """Write an adapter folder for XPolicyLab, after loading the checkpoint as it will be loaded there.
-
-    Args:
-        checkpoint: file from `ugr fit`.
-        out: the folder, `policy/<NAME>` of an XPolicyLab checkout.
-        execution: see `Deployment`.
-        cameras: XPolicyLab's names of the policy's cameras, where they differ from the usual ones.
-        copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
-
-    Returns:
-        The files written.
-
-    Raises:
-        ConfigError: the folder holds something else, or its name cannot be imported.
-        CheckpointError: the checkpoint cannot be evaluated.
-    """
-    require_module_name(out)
-    config = {"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": dict(cameras or {})}
-    model = Model(config)
-    named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in model.deployment.cameras.items())
-    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
-    return place_checkpoint("xpolicylab", checkpoint, out, values, copy)
+def write_adapter(checkpoint: Path, out: Path, **options: Any) -> list[Path]:
+    """Write an adapter folder for XPolicyLab; the options are those of `write_policy_folder`."""
+    return write_policy_folder("xpolicylab", Model, checkpoint, out, **options)
 
 
 def read_deployment(folder: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:

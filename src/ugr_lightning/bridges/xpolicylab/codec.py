@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ugr_lightning.errors import ConfigError, ProtocolError
+from ugr_lightning.errors import ProtocolError, missing_extra
 
 MAX_BYTES = 16 * 2**20
 """Of one frame; three cameras of 480x640 with depth are 6.5 MB."""
@@ -31,8 +31,7 @@ def require_extra() -> None:
         import msgpack  # noqa: F401
         import websockets  # noqa: F401
     except ImportError as error:
-        fix = "Install them with `pip install 'ugr-lightning[xpolicylab]'`."
-        raise ConfigError("XPolicyLab", "the packages msgpack and websockets", error, fix) from error
+        raise missing_extra("XPolicyLab", "xpolicylab", error) from error
 
 
 def pack(message: dict[str, Any]) -> bytes:
