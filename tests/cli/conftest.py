@@ -67,10 +67,9 @@ def ten_demonstrations(tmp_path):
 def untrained(ten_demonstrations):
     """Writes `policy_best.ckpt` of a policy that was told the statistics of ten demonstrations and learned nothing."""
 
-    def write(policy, folder):
-        data = ChunkDataModule(
-            root=str(ten_demonstrations), episodes=10, chunk_length=policy.chunk_length, after_end="hold"
-        )
+    def write(policy, folder, data=None):
+        where = data or {"root": str(ten_demonstrations)}
+        data = ChunkDataModule(**where, episodes=10, chunk_length=policy.chunk_length, after_end="hold")
         data.setup()
         policy.set_statistics(data.statistics)
         weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}

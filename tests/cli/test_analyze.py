@@ -10,6 +10,8 @@ from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import CAMERAS
+from ugr_lightning.data.layout import Joint, Layout
+from ugr_lightning.training.checkpoint import load_policy
 
 
 @pytest.fixture
@@ -36,6 +38,19 @@ def test_analyze_writes_numbers_tables_and_figures_and_says_one_sentence(command
     for name in ("calibration", "events"):
         assert np.asarray(Image.open(folder / f"{name}.png")).std() > 0
     assert not list(folder.glob("*.partial"))
+
+
+def test_data_with_a_folder_and_a_layout_of_their_own_are_found_again(ten_demonstrations, tmp_path, untrained):
+    place = ten_demonstrations / "click_alarmclock" / "demo_clean"
+    joints = (Joint(6, closed=0.0, open=2.0), 0, "right_joint_1")
+    chosen = {"folder": str(place), "layout": Layout(state=joints)}
+    untrained(TinyPolicy(cameras=CAMERAS, dim=3), tmp_path, chosen)
+    _, info = load_policy(tmp_path / "policy_best.ckpt")
+    assert Layout.of(info.data["layout"]) == Layout(state=joints)
+    command = ["analyze", str(tmp_path / "policy_best.ckpt"), "--resamples", "5", "--data"]
+    assert main([*command, str(place)]) == 0
+    assert "do not tell of these events: close, open" in (tmp_path / "analysis-policy_best/analysis.md").read_text()
+    assert main([*command, str(ten_demonstrations)]) == 2, "not a folder of demonstrations"
 
 
 def test_analyze_refuses_other_episodes_than_those_of_the_split(command, ten_demonstrations, capsys):

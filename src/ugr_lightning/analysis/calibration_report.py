@@ -182,8 +182,8 @@ def around_events(validation: Predictions, episodes: list[Episode], resamples: i
         resamples: draws of the bootstrap over episodes.
 
     Returns:
-        By kind that occurs: `count` of events, `lag` with means by lag, and `error_near` and `deviation_near`,
-        intervals of the relative value near events over that elsewhere.
+        By kind that occurs and that the demonstrations tell of: `count` of events, `lag` with means by lag, and
+        `error_near` and `deviation_near`, intervals of the relative value near events over that elsewhere.
     """
     assert validation.log_variance is not None
     lengths = np.array([episode.length for episode in episodes])
@@ -195,7 +195,7 @@ def around_events(validation: Predictions, episodes: list[Episode], resamples: i
     relative = [relative_to_position(values) for values in (error, deviation)]
     found = {}
     for kind in KINDS:
-        events = {name: events[kind] for name, events in here.items() if len(events[kind])}
+        events = {name: events[kind] for name, events in here.items() if len(events.get(kind, ()))}
         if not events:
             continue
         aligned = align(validation.episode, validation.step, K, lengths, events, REACH)

@@ -6,7 +6,6 @@ import numpy as np
 
 from ugr_lightning.contract import ACTION_DIM
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.errors import DataError
 
 GRIPPERS = (ACTION_DIM // 2 - 1, ACTION_DIM - 1)
 HALF_OPEN = 0.5
@@ -17,22 +16,21 @@ def find_events(episode: Episode) -> dict[str, np.ndarray]:
     """The time steps at which a demonstration meets or leaves things, and opens or closes a gripper.
 
     Args:
-        episode: a demonstration with recorded contacts.
+        episode: a demonstration.
 
     Returns:
         By kind, (m,) time steps of both arms: `contact` and `release` are the first steps with and without fingers
-        that touch something; `close` and `open` the first ones whose command is beyond half open.
-
-    Raises:
-        DataError: contacts were not recorded, as in RoboTwin's own files.
+        that touch something; `close` and `open` the first ones whose command is beyond half open. The first two are
+        missing where contacts were not recorded, as in other projects' files, the others for robots that do not have
+        our two grippers.
     """
-    if "contacts" not in episode.extras:
-        fix = "Analyse demonstrations recorded with `ugr collect`."
-        raise DataError(episode.path, "recorded contacts (`ugr/contacts`)", "none", fix)
-    touching = np.asarray(episode.extras["contacts"])[: episode.length].astype(int)  # (T, 2)
-    opened = (episode.action[:, GRIPPERS] > HALF_OPEN).astype(int)  # (T, 2)
-    touched, moved = np.diff(touching, axis=0), np.diff(opened, axis=0)
-    changes = {"contact": touched > 0, "release": touched < 0, "close": moved < 0, "open": moved > 0}
+    changes: dict[str, np.ndarray] = {}
+    if "contacts" in episode.extras:
+        touched = np.diff(np.asarray(episode.extras["contacts"])[: episode.length].astype(int), axis=0)  # (T - 1, 2)
+        changes |= {"contact": touched > 0, "release": touched < 0}
+    if episode.action.shape[1] == ACTION_DIM:
+        moved = np.diff((episode.action[:, GRIPPERS] > HALF_OPEN).astype(int), axis=0)  # (T - 1, 2)
+        changes |= {"close": moved < 0, "open": moved > 0}
     return {kind: np.unique(np.nonzero(change)[0] + 1) for kind, change in changes.items()}
 
 

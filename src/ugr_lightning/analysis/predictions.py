@@ -7,6 +7,7 @@ import torch
 
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import DataError
 
 STD_FLOOR = 1e-2  # as in the policies' normalisation
@@ -85,7 +86,7 @@ def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end
     Args:
         policy: from the checkpoint.
         trained: what the checkpoint says about its data.
-        root: folder of recordings.
+        root: folder of recordings, `data.root` of the training; where that had a `data.folder`, that one.
         after_end: `mask` or `hold` in place of the checkpoint's own.
 
     Raises:
@@ -106,6 +107,8 @@ def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end
         state=trained["state"],
         action_offset=trained["action_offset"],
         after_end=after_end or trained["after_end"],  # type: ignore[arg-type]
+        folder=root if trained.get("elsewhere") else None,
+        layout=Layout.of(trained["layout"]) if "layout" in trained else DEFAULT_LAYOUT,
     )
     data.setup()
     if data.split != trained["split"]:

@@ -12,6 +12,7 @@ from ugr_lightning.analysis import calibration_report as report
 from ugr_lightning.analysis.budgets import sweep, sweep_figure, sweep_table
 from ugr_lightning.analysis.calibration_figures import calibration_figure, event_figure
 from ugr_lightning.analysis.estimators import estimate, estimator_table
+from ugr_lightning.analysis.events import KINDS, find_events
 from ugr_lightning.analysis.failure import detect_failures
 from ugr_lightning.analysis.predictions import Predictions, predict
 from ugr_lightning.contract import ChunkPolicy
@@ -131,7 +132,10 @@ def begin_study(
         "events": events,
         **found,
     }
-    return Study(policy, data, validation, training, stride, resamples, budget, content, tables, figures, [verdict])
+    sentences = [verdict]
+    if unknown := [kind for kind in KINDS if not any(kind in find_events(each) for each in data.demonstrations)]:
+        sentences.append(f"The demonstrations do not tell of these events: {', '.join(unknown)}.")
+    return Study(policy, data, validation, training, stride, resamples, budget, content, tables, figures, sentences)
 
 
 def require_budgets(policy: ChunkPolicy) -> None:

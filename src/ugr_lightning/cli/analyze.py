@@ -34,7 +34,7 @@ def _analyze(
         ckpt_path: `best`, `best_loss`, `last`, or a checkpoint file.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
-        data: folder of the recordings that the policy was trained on.
+        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
         stride: control steps between two queries.
         after_end: count steps past the end of an episode (`hold`) or not (`mask`); null does as the training did.
         resamples: draws of the bootstrap over episodes.

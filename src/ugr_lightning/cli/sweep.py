@@ -43,7 +43,8 @@ def _sweep(
             `[]` leaves budgets out, for policies that do not rank steps.
         executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk; budgets are
             compared in the first, the others with it. Null means all three that the policy can.
-        data: folder of the recordings that the policy was trained on, for the offline error; null leaves it out.
+        data: folder of the recordings that the policy was trained on (`data.root`, or `data.folder` if it had one),
+            for the offline error; null leaves it out.
         stride: control steps between two queries of the offline error.
         workers: simulator processes.
         out: folder for episodes, tables and figure; null means `sweep-<checkpoint>` beside the checkpoint.

@@ -49,7 +49,7 @@ class ChunkDataModule(lightning.LightningDataModule):
     """Action chunks from demonstrations of one task.
 
     After `setup`: `data` (`ChunkDataset` over all episodes), `episode_split`, `split` and `statistics`; `image_size`
-    then is the size of the pictures, also where it was null.
+    then is the size of the pictures, also where it was null. `elsewhere` says whether `folder` was given.
 
     Args:
         task: task name.

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -72,6 +72,17 @@ class Layout:
         for name in ("state", "action"):
             if self.dim(name) < 1:
                 raise ConfigError(f"data.layout.{name}", "at least one joint", 0, "Correct the number.")
+
+    @classmethod
+    def of(cls, content: Mapping[str, Any]) -> "Layout":
+        """The layout that `dataclasses.asdict` turned into plain containers, as a checkpoint has it."""
+
+        def joints(given: Any) -> Any:
+            if given is None or isinstance(given, int):
+                return given
+            return tuple(Joint(**joint) if isinstance(joint, Mapping) else joint for joint in given)
+
+        return cls(dict(content["cameras"]), joints(content["state"]), joints(content["action"]))
 
     @property
     def state_dim(self) -> int:

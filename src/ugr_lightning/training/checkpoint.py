@@ -4,7 +4,7 @@ import hashlib
 import os
 import pickle
 import platform
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, is_dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,10 @@ from ugr_lightning.training.policy_folder import folder_sha256, read_policy_fold
 
 FORMAT = 1
 _PREFIX = "policy."
-_DATA = ("task", "setting", "image_size", "state", "action_offset", "after_end", "episodes", "split_seed", "split")
+_DATA = (
+    *("task", "setting", "image_size", "state", "action_offset", "after_end", "episodes", "split_seed", "split"),
+    *("elsewhere", "layout"),
+)
 
 
 @dataclass(frozen=True)
@@ -70,6 +73,8 @@ def describe(policy: ChunkPolicy, datamodule: LightningDataModule | None) -> dic
 
 def plain(value: Any) -> Any:
     """Plain containers only, so that `weights_only=True` loads them; paths and enumerations become strings."""
+    if is_dataclass(value) and not isinstance(value, type):
+        return plain(asdict(value))
     if isinstance(value, dict):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, (list, tuple, set, frozenset)):
