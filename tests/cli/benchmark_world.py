@@ -44,7 +44,7 @@ def pretend_to_simulate():
     from ugr_lightning.sim import render
 
     runner.run_episodes = partial(runner.run_episodes, simulator=FakeSimulator)
-    render.require_rendering = lambda: None
+    render.require_rendering = lambda task: None
 
 
 if __name__ == "__main__":  # the simulator's processes import this file as well, and shall be quick

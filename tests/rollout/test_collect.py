@@ -208,7 +208,7 @@ def test_a_recording_says_its_setting_and_a_folder_holds_one_setting(tmp_path):
 
 
 def test_a_folder_of_another_version_of_the_task_is_not_added_to(tmp_path, monkeypatch):
-    monkeypatch.setattr("ugr_lightning.rollout.collect.task_names", lambda: ("reach",))
+    monkeypatch.setattr("ugr_lightning.rollout.collect.all_task_names", lambda: ("reach",))
     monkeypatch.setattr("ugr_lightning.rollout.collect.task_version", lambda task: 1)
     record(tmp_path, episodes=1)
     monkeypatch.setattr("ugr_lightning.rollout.collect.task_version", lambda task: 2)
