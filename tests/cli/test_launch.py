@@ -12,7 +12,7 @@ def writing(path, code=0):
 
 def test_without_submitit_it_says_what_to_do(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "submitit", None)
-    with pytest.raises(ConfigError, match="pip install submitit"):
+    with pytest.raises(ConfigError, match=r"ugr-lightning\[cluster\]"):
         launch([["true"]], tmp_path, {})
 
 
