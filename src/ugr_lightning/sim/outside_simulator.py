@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from ugr_lightning.contract import ACTION_DIM
-from ugr_lightning.errors import ConfigError, NumericsError, SimulationError
+from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim.expert import ExpertStep
-from ugr_lightning.sim.simulator import Frame
+from ugr_lightning.sim.simulator import Frame, checked_command
 
 SETTING = "demo_clean"
 
@@ -95,13 +95,7 @@ class OutsideSimulator(ABC):
             SimulationError: `reset` has not been called, or an action of another length.
         """
         self._require_episode()
-        action = np.asarray(action, np.float32)
-        if action.shape != (self.action_dim,):
-            raise SimulationError("action", f"shape ({self.action_dim},)", action.shape, "Give one command.")
-        if not np.isfinite(action).all():
-            bad = np.flatnonzero(~np.isfinite(action)).tolist()
-            raise NumericsError("action", "finite numbers", f"NaN or infinity at {bad}", "Check the policy's output.")
-        self._succeeded = self._advance(action) or self._succeeded
+        self._succeeded = self._advance(checked_command(action, self.action_dim)) or self._succeeded
         return self._shown(look)
 
     def expert(self) -> Iterator[ExpertStep]:

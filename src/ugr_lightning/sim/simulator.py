@@ -46,6 +46,22 @@ class Frame(NamedTuple):
     success: bool
 
 
+def checked_command(action: np.ndarray, dim: int) -> np.ndarray:
+    """A command that a simulator may see, (A,) float32.
+
+    Raises:
+        NumericsError: it has a NaN or an infinity.
+        SimulationError: it has another length than `dim`.
+    """
+    action = np.asarray(action, np.float32)
+    if action.shape != (dim,):
+        raise SimulationError("action", f"shape ({dim},)", action.shape, f"Give one {dim}-dimensional command.")
+    if not np.isfinite(action).all():
+        bad = np.flatnonzero(~np.isfinite(action)).tolist()
+        raise NumericsError("action", "finite numbers", f"NaN or infinity at {bad}", "Check the policy's output.")
+    return action
+
+
 class Simulator:
     """Runs episodes of a task; a context manager.
 
@@ -128,13 +144,7 @@ class Simulator:
             SimulationError: `reset` has not been called.
         """
         self._require_episode()
-        action = np.asarray(action, np.float32)
-        if action.shape != (ACTION_DIM,):
-            raise SimulationError("action", f"shape ({ACTION_DIM},)", action.shape, "Give one 14-dimensional command.")
-        if not np.isfinite(action).all():
-            bad = np.flatnonzero(~np.isfinite(action)).tolist()
-            raise NumericsError("action", "finite numbers", f"NaN or infinity at {bad}", "Check the policy's output.")
-        self._env._step_action(action)
+        self._env._step_action(checked_command(action, ACTION_DIM))
         return self._frame(look)
 
     def expert(self) -> Iterator[ExpertStep]:
