@@ -69,7 +69,8 @@ def test_a_folder_of_safetensors_is_the_same_policy(refined, capsys):
     assert main(["inspect", "folder"]) == 0
     assert "unshuffle" in capsys.readouterr().out
     assert main(["export", "folder", "--to", "safetensors", "--out", "copy"]) == 0
-    assert Path("copy/model.safetensors").read_bytes() == Path("folder/model.safetensors").read_bytes()
+    same = Path("copy/model.safetensors").read_bytes() == Path("folder/model.safetensors").read_bytes()
+    assert same, "a copy of a copy"
 
 
 def test_a_policy_that_samples_and_looks_back_is_exported_too(tmp_path, monkeypatch, capsys):

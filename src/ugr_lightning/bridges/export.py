@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
-from safetensors.torch import save_file
 from torch import Tensor
 
 from ugr_lightning.bridges.act_checkpoint import EXTRA, export_act, import_act
@@ -29,6 +28,7 @@ from ugr_lightning.training.policy_folder import (
     read_policy_folder,
     read_safetensors,
     write_policy_folder,
+    write_safetensors,
 )
 
 Target = Literal["act", "lerobot", "safetensors", "onnx", "torch"]
@@ -180,7 +180,7 @@ def _lerobot(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
     for name, content in made.objects.items():
         (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     for name, tensors in made.tensors.items():
-        save_file(tensors, folder / name, {"format": "pt"})
+        write_safetensors(folder / name, tensors)
     again, _ = import_lerobot(read_json(folder / CONFIG), read_safetensors(folder / WEIGHTS), folder)
     return _asked(again), made.notes
 

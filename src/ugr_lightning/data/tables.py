@@ -1,7 +1,7 @@
 """Parquet tables that nobody vouches for: columns and rows are checked before they are loaded."""
 
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from ugr_lightning.errors import DataError, missing_extra
 MAX_BYTES = 2**27  # of numbers that are loaded at a time
 MANY = 2**16  # rows of numbers that are decoded at a time
 MAX_PICTURE_BYTES = 2**29  # of an episode's encoded pictures
+ONE_SIZE = f"pictures of one size, at most {MAX_PIXELS} pixels a side"
 FIX = "Copy the dataset again, or leave this episode out."
 
 
@@ -47,6 +48,15 @@ def read_table(path: Path, columns: Sequence[str], rows: tuple[int, int] | None 
         DataError: missing, damaged, without one of the columns or rows, or absurdly large.
         ConfigError: pyarrow is not installed.
     """
+    return import_pyarrow().concat_tables(list(read_pieces(path, columns, rows)))
+
+
+def read_pieces(path: Path, columns: Sequence[str], rows: tuple[int, int] | None = None) -> Iterator[Any]:
+    """The tables that `read_table` puts together, decoded one after another; the first may be empty.
+
+    What is absurdly large is noticed early. What the file says of the size of its columns would not do: equal rows
+    are stored once. Nor may it be looked at: pyarrow ends the process where that part of a file is damaged.
+    """
     pyarrow = import_pyarrow()
     if not path.is_file():
         raise DataError(path, "a Parquet file", "no such file", "Download all files of the dataset.")
@@ -62,44 +72,43 @@ def read_table(path: Path, columns: Sequence[str], rows: tuple[int, int] | None 
                 raise DataError(path, f"rows {first} to {last}", f"{starts[-1]} rows", FIX)
             groups = [i for i in range(file.num_row_groups) if starts[i] < last and starts[i + 1] > first]
             skipped = int(starts[groups[0]]) if groups else 0
-            return _read_rows(file, path, groups, columns, first - skipped, last - first)
+            yield from _decode(file, path, groups, columns, first - skipped, last - first)
     except (pyarrow.ArrowException, OSError, ValueError, KeyError, TypeError, MemoryError) as error:
         got = " ".join(f"{type(error).__name__}: {error}".split())[:160]
         raise DataError(path, "a readable Parquet file", got, FIX) from error
 
 
-def _read_rows(file: Any, path: Path, groups: Sequence[int], columns: Sequence[str], first: int, count: int) -> Any:
-    """Some rows of some row groups, decoded a few at a time, so that what is absurdly large is noticed early.
-
-    What the file says of the size of its columns would not do: equal rows are stored once. Nor may it be looked at:
-    pyarrow ends the process where that part of a file is damaged.
-    """
+def _decode(
+    file: Any, path: Path, groups: Sequence[int], columns: Sequence[str], first: int, count: int
+) -> Iterator[Any]:
+    """Some rows of some row groups, a few at a time; at first none, which has the columns' types."""
     pyarrow = import_pyarrow()
     schema = pyarrow.schema([file.schema_arrow.field(column) for column in columns])
+    yield schema.empty_table()
     rows = min(_rows_at_once(field.type) for field in schema)
-    most, kept, size, at = MAX_PICTURE_BYTES if rows < MANY else MAX_BYTES, [], 0, 0
+    most, found, size, at = MAX_PICTURE_BYTES if rows < MANY else MAX_BYTES, 0, 0, 0
     options = {"batch_size": rows, "columns": list(columns), "use_threads": False}
     for batch in file.iter_batches(row_groups=list(groups), **options) if count else ():
         start, end = max(0, first - at), min(len(batch), first + count - at)
         at += len(batch)
         if end <= start:
             continue
-        kept.append(batch.select(list(columns)).slice(start, end - start))
-        size += kept[-1].nbytes
+        piece = batch.select(list(columns)).slice(start, end - start)
+        found, size = found + len(piece), size + piece.nbytes
         if size > most:
             raise DataError(path, f"at most {most} bytes of {', '.join(columns)}"[:200], f"{size} and more", FIX)
+        yield pyarrow.Table.from_batches([piece])
         if at >= first + count:
             break
-    if sum(map(len, kept)) != count:
-        raise DataError(path, f"{count} rows from {first} on", sum(map(len, kept)), FIX)
-    return pyarrow.Table.from_batches(kept) if kept else schema.empty_table()
+    if found != count:
+        raise DataError(path, f"{count} rows from {first} on", found, FIX)
 
 
 def _rows_at_once(kind: Any) -> int:
     """How many rows of a column may be decoded together: numbers and lists of them, texts, or pictures."""
     kinds = import_pyarrow().types
     if kinds.is_struct(kind) or kinds.is_binary(kind) or kinds.is_large_binary(kind):
-        return 4
+        return 1
     if kinds.is_list(kind) or kinds.is_large_list(kind) or kinds.is_fixed_size_list(kind):
         kind = kind.value_type
     return MANY if kinds.is_primitive(kind) else 64
@@ -204,27 +213,39 @@ class TablePictures(FrameSource):
     def _load(self) -> list[list[bytes]]:
         if self._encoded is None:
             table = read_table(self.path, self.columns, self.rows)
-            self._encoded = [
-                [_picture(item, self.path, c) for item in table.column(c).to_pylist()] for c in self.columns
-            ]
+            self._encoded = [_pictures(table, column, self.path) for column in self.columns]
         return self._encoded
 
     def _check(self) -> tuple[int, int]:
         """The common size of all pictures, by their headers."""
-        sizes = set()
-        for column, pictures in zip(self.columns, self._load(), strict=True):
-            for step, data in enumerate(pictures):
-                try:
-                    with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
-                        sizes.add((image.size[1], image.size[0]))
-                except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
-                    where = f"{self.path}:{column}[{step}]"
-                    raise DataError(where, "a PNG or JPEG", str(error)[:120], FIX) from error
-        self.close()
-        if len(sizes) != 1 or max(max(sizes)) > MAX_PIXELS:
-            expected = f"pictures of one size, at most {MAX_PIXELS} pixels a side"
-            raise DataError(f"{self.path}:{self.columns}", expected, sorted(sizes), "Choose cameras of one size.")
+        sizes, first = set(), 0
+        for piece in read_pieces(self.path, self.columns, self.rows):
+            for column in self.columns:
+                for step, data in enumerate(_pictures(piece, column, self.path), start=first):
+                    sizes.add(_size(data, f"{self.path}:{column}[{step}]"))
+            first += len(piece)
+        if len(sizes) != 1:
+            raise DataError(f"{self.path}:{self.columns}", ONE_SIZE, sorted(sizes), "Choose cameras of one size.")
         return sizes.pop()
+
+
+def _size(data: bytes, where: str) -> tuple[int, int]:
+    """The (height, width) of an encoded picture, by its header."""
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "JPEG")) as image:
+            width, height = image.size
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
+        raise DataError(where, "a PNG or JPEG", str(error)[:120], FIX) from error
+    if max(height, width) > MAX_PIXELS:
+        raise DataError(where, ONE_SIZE, (height, width), "Choose cameras of one size.")
+    most = 8 * height * width + 2**20  # without compression at 16 bits a channel, and whatever else a header holds
+    if len(data) > most:
+        raise DataError(where, f"at most {most} bytes for a picture of {(height, width)}", len(data), FIX)
+    return height, width
+
+
+def _pictures(table: Any, column: str, path: Path) -> list[bytes]:
+    return [_picture(item, path, column) for item in table.column(column).to_pylist()]
 
 
 def _picture(item: Any, path: Path, column: str) -> bytes:

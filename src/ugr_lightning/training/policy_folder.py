@@ -2,11 +2,12 @@
 
 import hashlib
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from ugr_lightning.errors import CheckpointError
@@ -34,6 +35,17 @@ def read_safetensors(path: Path) -> dict[str, Tensor]:
     except (SafetensorError, OSError, ValueError, RuntimeError, MemoryError) as error:
         got = f"a damaged file ({str(error).splitlines()[0][:160]})"
         raise CheckpointError(path, "a whole safetensors file", got, "Copy or export the folder again.") from error
+
+
+def write_safetensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Write a file of tensors, the same bytes each time.
+
+    Args:
+        path: where to.
+        tensors: by name; the file has a copy of what they share.
+    """
+    stored = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    path.write_bytes(save(stored, {"format": "pt"}))  # with more than one entry, their order would be random
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -79,8 +91,7 @@ def write_policy_folder(folder: Path, weights: dict[str, Tensor], about: dict[st
         weights: the policy's state dict.
         about: `policy` (as in a checkpoint), `global_step` and `epoch`: plain containers.
     """
-    stored = {name: value.detach().cpu().contiguous().clone() for name, value in weights.items()}
-    save_file(stored, folder / WEIGHTS, {"format": "pt", "library": LIBRARY})
+    write_safetensors(folder / WEIGHTS, weights)
     (folder / CONFIG).write_text(json.dumps({"library": LIBRARY, **about}, indent=2) + "\n", encoding="utf-8")
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from PIL import Image
 
 from ugr_lightning.data.formats import formats
 
@@ -303,7 +304,9 @@ def _lerobot(cases):
     cases.bytes_of("lerobot video", test_lerobot.VIDEO, 16)
     for file in (LEROBOT_EPISODES, LEROBOT_DATA):
         cases.content("lerobot", f"{file} without end", file, _endless())
-    cases.add("lerobot", "one large picture everywhere", lambda folder: _large(folder / LEROBOT_DATA), True)
+    larges = {"one large picture everywhere": b"", "a picture with a long tail everywhere": _picture()}
+    for case, start in larges.items():
+        cases.add("lerobot", case, lambda folder, start=start: _large(folder / LEROBOT_DATA, start), True)
     _files(cases, "lerobot", LEROBOT_DATA)
     _files(cases, "lerobot video", test_lerobot.VIDEO)
 
@@ -319,10 +322,18 @@ def _endless():
     return out.getvalue()
 
 
-def _large(path):
+def _picture():
+    """A good one."""
+    out = io.BytesIO()
+    Image.fromarray(np.zeros((4, 6, 3), np.uint8)).save(out, "PNG")
+    return out.getvalue()
+
+
+def _large(path, start):
     """The same 15 MB in 28 rows of three cameras, stored once."""
     table = pyarrow.parquet.read_table(path)
-    same = pyarrow.DictionaryArray.from_arrays(np.zeros(len(table), np.int32), pyarrow.array([bytes(15_000_000)]))
+    data = pyarrow.array([start + bytes(15_000_000)])
+    same = pyarrow.DictionaryArray.from_arrays(np.zeros(len(table), np.int32), data)
     pictures = pyarrow.StructArray.from_arrays([same, pyarrow.array(["x.png"] * len(table))], ["bytes", "path"])
     for camera in test_lerobot.CAMERAS:
         name = f"observation.images.{camera}"
