@@ -44,7 +44,7 @@ def model_card(
         "",
         f"# {name}",
         "",
-        f"A `{kind}` policy of {count / 1e6:.2f} M parameters: {len(about['cameras'])} cameras and "
+        f"Policy `{kind}`, {count / 1e6:.2f} M parameters: {len(about['cameras'])} cameras and "
         f"{about['state_dim']} joint values in, chunks of {about['chunk_length']} x {about['action_dim']} commands "
         "out, robot units on both sides.",
         "",
