@@ -28,8 +28,16 @@ def test_a_report_is_printed_or_written(files, tmp_path, capsys):
         "report.html",
         "rates.csv",
         "comparisons.csv",
+        "summary.jsonl",
     }
     assert "Ours" in (tmp_path / "new" / "report.html").read_text()
+
+
+def test_a_report_can_be_made_again_of_the_summary_beside_it(files, tmp_path):
+    assert main(["report", *files, "--out", "first"]) == 0
+    assert main(["report", "first", "--out", "second"]) == 0
+    for path in (tmp_path / "first").iterdir():
+        assert path.read_text() == (tmp_path / "second" / path.name).read_text(), path.name
 
 
 def test_a_broken_line_is_named(files, tmp_path, capsys):

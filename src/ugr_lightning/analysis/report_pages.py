@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from ugr_lightning.analysis.conclusions import conclude, described_execution
 from ugr_lightning.analysis.report import ALL_TASKS, Contest, Rate, Report
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 
 METHOD = (
     "Rates carry n and the 95 % Wilson interval over all episodes. Policies are compared on the seeds and training "
@@ -61,7 +61,7 @@ def write_report(report: Report, folder: Path, title: str) -> list[Path]:
         "comparisons.csv": _csv(CONTEST_HEAD, contest_records(report.contests)),
     }
     for name, text in texts.items():
-        publish(folder / name, lambda partial, text=text: _write(partial, text))  # type: ignore[misc]
+        publish_text(folder / name, text)
     return [folder / name for name in texts]
 
 
@@ -228,7 +228,3 @@ def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
     writer.writerow(head)
     writer.writerows(rows)
     return buffer.getvalue()
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text, encoding="utf-8")

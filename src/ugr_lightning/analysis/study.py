@@ -17,7 +17,7 @@ from ugr_lightning.analysis.failure import detect_failures
 from ugr_lightning.analysis.predictions import Predictions, predict
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish, publish_text
 from ugr_lightning.errors import CheckpointError, ConfigError, DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
@@ -61,7 +61,7 @@ class Study:
         title = f"Uncertainty of {self.content['checkpoint']['file']}"
         write_page(folder, "analysis", title, self.sentences, self.tables, self.figures, self.content)
         prior = json.dumps(plain(self.content["position"]["training_error"]))
-        publish(folder / "prior.json", partial(_write_text, prior + "\n"))
+        publish_text(folder / "prior.json", prior + "\n")
 
 
 def write_page(
@@ -88,7 +88,7 @@ def write_page(
     page = "\n\n".join([f"# {title}", *sentences, *map(report.as_markdown, tables), *pictures])
     numbers = json.dumps(plain(content), indent=1, allow_nan=False)
     for file, text in ((f"{name}.json", numbers), (f"{name}.md", page)):
-        publish(folder / file, partial(_write_text, text + "\n"))
+        publish_text(folder / file, text + "\n")
     for file, figure in figures.items():
         publish(folder / f"{file}.png", partial(figure.savefig, format="png", dpi=120))
 
@@ -212,7 +212,3 @@ def plain(value: Any) -> Any:
     if isinstance(value, (list, tuple)):
         return [plain(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _write_text(text: str, path: Path) -> None:
-    path.write_text(text)

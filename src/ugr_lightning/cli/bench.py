@@ -21,7 +21,7 @@ from ugr_lightning.analysis.benchmark import (
     measure_simulation,
     measure_training,
 )
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.precision import bf16_is_fast
 
@@ -83,12 +83,7 @@ def run_bench(
         torch.set_num_threads(before)
     if json_path is not None:
         content = {"machine": machine, "quick": quick, "measurements": [item._asdict() for item in measurements]}
-        text = json.dumps(content, indent=2) + "\n"
-
-        def write(partial: Path) -> None:
-            partial.write_text(text)
-
-        publish(json_path, write)
+        publish_text(json_path, json.dumps(content, indent=2) + "\n")
         print(f"written to {json_path}", file=out)
     return 0
 

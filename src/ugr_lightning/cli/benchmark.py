@@ -13,7 +13,7 @@ from ugr_lightning.cli.grid import Grid, Job, fingerprint, flat, read_grid, reso
 from ugr_lightning.cli.lock import Lock, locked
 from ugr_lightning.cli.runs import resolve_checkpoint, versions_of
 from ugr_lightning.cli.subprocesses import Failure, run_and_watch, terminable
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.errors import ConfigError, UGRError
 from ugr_lightning.rollout.evaluations import RESULTS_FILE, RUN_FILE, RunInfo
 from ugr_lightning.rollout.progress import clock
@@ -196,7 +196,7 @@ class Benchmark:
         else:
             info = RunInfo(job.policy, job.task, job.training_seed, fingerprint(config))
             text = yaml.safe_dump(config, sort_keys=False)
-            publish(path, lambda partial: _write(partial, text))
+            publish_text(path, text)
         info.modes = job.modes
         info.write(place)
         return info
@@ -267,9 +267,4 @@ def _require_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> No
 
 
 def _copy(source: Path, target: Path) -> None:
-    text = source.read_text()
-    publish(target, lambda partial: _write(partial, text))
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text)
+    publish_text(target, source.read_text())

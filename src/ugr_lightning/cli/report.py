@@ -26,10 +26,11 @@ def _report(
     """Compare policies: success with intervals, paired tests, and what may be concluded from them.
 
     Args:
-        paths: results folders of `ugr benchmark`.
+        paths: folders of `ugr benchmark`, or of earlier reports.
         runs: single results files, each `NAME=FILE`; one name may occur for several training seeds.
         baseline: compare the others with this policy only; null compares all pairs.
-        out: folder for `report.md`, `report.html`, `rates.csv` and `comparisons.csv`; null prints Markdown.
+        out: folder for `report.md`, `report.html`, `rates.csv`, `comparisons.csv` and `summary.jsonl`, of which
+            the same report can be made again; null prints Markdown.
         title: heading of the report.
         power: instead of a report, the episodes needed to tell two success rates apart, such as `0.90 0.95`.
         discordance: with `power`, the share of shared seeds on which exactly one policy succeeds; null for a table.
@@ -41,9 +42,10 @@ def _report(
         raise ConfigError("ugr report", "results", "none", fix)
     from ugr_lightning.analysis.report import build_report
     from ugr_lightning.analysis.report_pages import to_markdown, write_report
-    from ugr_lightning.rollout.evaluations import read_benchmark, read_labelled
+    from ugr_lightning.rollout.evaluations import read_labelled
+    from ugr_lightning.rollout.summaries import SUMMARY_FILE, read_evaluations, write_summary
 
-    evaluations = [item for path in paths for item in read_benchmark(path)]
+    evaluations = [item for path in paths for item in read_evaluations(path)]
     for text in runs:
         label, separator, path = text.partition("=")
         if not separator or not label or not path:
@@ -55,8 +57,9 @@ def _report(
     if out is None:
         print(to_markdown(report, title), end="")
     else:
-        for written in write_report(report, Path(out), title):
-            print(written)
+        written = write_report(report, Path(out), title)
+        write_summary(evaluations, Path(out) / SUMMARY_FILE)
+        print(*written, Path(out) / SUMMARY_FILE, sep="\n")
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.data.formats import EpisodeFormat, detect, find_format, formats
 from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import ConfigError, DataError
@@ -63,7 +63,7 @@ def convert(
     note = _describe(found, source, to)
     _check_note(target, note)
     try:
-        publish(target / NOTE, lambda partial: _write_note(partial, note))
+        publish_text(target / NOTE, json.dumps(note, indent=2) + "\n")
         form.write(target, found, lambda index: done("writing", index + 1, len(found)))
         _check_written(form, target, found, done)
     except OSError as error:
@@ -125,10 +125,6 @@ def _describe(episodes: Sequence[Episode], source: Path, to: str) -> dict[str, A
         "episodes": [episode.name for episode in episodes],
         "sha256": digest.hexdigest(),
     }
-
-
-def _write_note(path: Path, note: dict[str, Any]) -> None:
-    path.write_text(json.dumps(note, indent=2) + "\n")
 
 
 def _check_note(target: Path, note: dict[str, Any]) -> None:

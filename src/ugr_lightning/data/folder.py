@@ -66,10 +66,19 @@ def publish(path: Path, write: Callable[[Path], None]) -> None:
         os.close(folder)
 
 
+def publish_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, complete or not at all."""
+
+    def write(partial: Path) -> None:
+        partial.write_text(text, encoding="utf-8")
+
+    publish(path, write)
+
+
 def write_seeds(folder: Path, seeds: Sequence[int]) -> None:
     """Write `seed.txt`: the simulator seed of every episode, by index, separated by spaces."""
     text = " ".join(str(int(seed)) for seed in seeds)
-    publish(Path(folder) / "seed.txt", lambda partial: _write_text(partial, text))
+    publish_text(Path(folder) / "seed.txt", text + "\n")
 
 
 def read_seeds(folder: Path) -> list[int]:
@@ -91,7 +100,7 @@ def read_seeds(folder: Path) -> list[int]:
 def write_scene_info(folder: Path, scenes: Mapping[int, Mapping[str, Any]]) -> None:
     """Write `scene_info.json`: by `episode_<index>`, what the scene looked like at reset."""
     content = {f"episode_{index}": scenes[index] for index in sorted(scenes)}
-    publish(Path(folder) / "scene_info.json", lambda partial: _write_json(partial, content))
+    _publish_json(Path(folder) / "scene_info.json", content)
 
 
 def read_scene_info(folder: Path) -> dict[int, dict[str, Any]]:
@@ -114,15 +123,11 @@ def write_instructions(folder: Path, index: int, seen: Sequence[str], unseen: Se
     """Write `instructions/episode<index>.json`: what the robot is told to do, in words."""
     content = {"seen": list(seen), "unseen": list(unseen)}
     path = Path(folder) / "instructions" / f"episode{index}.json"
-    publish(path, lambda partial: _write_json(partial, content))
+    _publish_json(path, content)
 
 
-def _write_text(path: Path, text: str) -> None:
-    path.write_text(text + "\n")
-
-
-def _write_json(path: Path, content: object) -> None:
-    _write_text(path, json.dumps(content, indent=2, default=_plain))
+def _publish_json(path: Path, content: object) -> None:
+    publish_text(path, json.dumps(content, indent=2, default=_plain) + "\n")
 
 
 def _plain(value: object) -> object:

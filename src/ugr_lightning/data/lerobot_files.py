@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish, publish_text
 from ugr_lightning.data.tables import import_pyarrow, read_table
 from ugr_lightning.data.video import import_av, write_videos
 from ugr_lightning.errors import ConfigError, DataError
@@ -268,7 +268,4 @@ def _publish_all(
 
 
 def _write_json(path: Path, content: object) -> None:
-    def write(partial: Path) -> None:
-        partial.write_text(json.dumps(content, indent=4) + "\n")
-
-    publish(path, write)
+    publish_text(path, json.dumps(content, indent=4) + "\n")

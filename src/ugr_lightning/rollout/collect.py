@@ -14,6 +14,7 @@ from typing import IO, Any
 from ugr_lightning.data.folder import (
     episode_path,
     find_episodes,
+    publish_text,
     read_scene_info,
     read_seeds,
     write_instructions,
@@ -24,7 +25,7 @@ from ugr_lightning.data.formats import RECORDED, recognise
 from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.progress import Progress
-from ugr_lightning.rollout.recorder import Outcome, Recorder, publish_text, staged_episode, staged_scene, staged_video
+from ugr_lightning.rollout.recorder import Outcome, Recorder, staged_episode, staged_scene, staged_video
 from ugr_lightning.rollout.workers import Worker, WorkerLostError, open_simulator, start_all, wait_for_any
 from ugr_lightning.sim.settings import check_setting
 from ugr_lightning.sim.tasks import all_task_names, check_task, task_summaries, task_version

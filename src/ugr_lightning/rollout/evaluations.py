@@ -8,7 +8,7 @@ from pathlib import Path
 import yaml
 
 from ugr_lightning.contract import EpisodeResult
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.results import read_results
 
@@ -44,7 +44,7 @@ class RunInfo:
     def write(self, folder: Path) -> None:
         """Write `run.json` into a folder, aside first."""
         text = json.dumps(asdict(self), indent=2) + "\n"
-        publish(folder / RUN_FILE, lambda partial: _write(partial, text))
+        publish_text(folder / RUN_FILE, text)
 
     @classmethod
     def read(cls, folder: Path) -> "RunInfo":
@@ -139,7 +139,3 @@ def _once(path: Path, results: Iterable[EpisodeResult]) -> list[EpisodeResult]:
             fix = "Remove the file and evaluate again; the same seed has to go the same way."
             raise DataError(where, "each episode once", "two with different outcomes", fix)
     return list(kept.values())
-
-
-def _write(path: Path, text: str) -> None:
-    path.write_text(text)

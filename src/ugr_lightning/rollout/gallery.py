@@ -10,11 +10,10 @@ import numpy as np
 from PIL import Image
 
 from ugr_lightning.contract import CAMERAS
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish, publish_text
 from ugr_lightning.data.jpeg import decode_jpeg, encode_frame
 from ugr_lightning.errors import SimulationError
 from ugr_lightning.rollout.progress import Progress
-from ugr_lightning.rollout.recorder import publish_text
 from ugr_lightning.rollout.spread import spread
 from ugr_lightning.rollout.survey import FIRST_SEED
 from ugr_lightning.rollout.video import compose_frames, write_video

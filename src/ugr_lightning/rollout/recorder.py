@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ugr_lightning.data.folder import publish
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.data.formats.robotwin import write_episode
 from ugr_lightning.data.jpeg import encode_frame
 from ugr_lightning.errors import DataError, SimulationError
@@ -68,15 +68,6 @@ def staged_scene(staging: Path, seed: int) -> Path:
 def staged_video(staging: Path, seed: int) -> Path:
     """The video of a staged episode, where one was asked for."""
     return staging / f"seed{seed}.mp4"
-
-
-def publish_text(path: Path, text: str) -> None:
-    """Write a text file, complete or not at all."""
-
-    def write(partial: Path) -> None:
-        partial.write_text(text)
-
-    publish(path, write)
 
 
 def record_episode(simulator: Any, seed: int, noise: Noise, *, attempt: int = 0, views: bool = False) -> Recording:

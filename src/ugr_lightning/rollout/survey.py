@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ugr_lightning.data.folder import publish_text
 from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.noise import Noise
 from ugr_lightning.rollout.progress import Progress
-from ugr_lightning.rollout.recorder import Recorder, publish_text, staged_episode
+from ugr_lightning.rollout.recorder import Recorder, staged_episode
 from ugr_lightning.rollout.results import wilson_interval
 from ugr_lightning.rollout.runner import run_episodes
 from ugr_lightning.rollout.spread import spread
