@@ -73,6 +73,21 @@ def test_there_and_back_is_exact(name, recording, tmp_path):
             ]
 
 
+def test_two_conversions_into_one_folder_at_once_are_refused(recording, tmp_path):
+    seen = []
+
+    def begin_another(what, number, total):
+        if what == "writing" and not seen:
+            with pytest.raises(DataError) as error:
+                convert(recording, tmp_path / "out", "act")
+            seen.append(str(error.value))
+
+    convert(recording, tmp_path / "out", "act", done=begin_another)
+    assert "another conversion" in seen[0]
+    assert len(read_all(tmp_path / "out")) == 3
+    convert(recording, tmp_path / "out", "act")
+
+
 def _stop_at(monkeypatch, call):
     """Ends the conversion at the given rename, as a loss of power would: nothing is tidied up."""
     count = 0

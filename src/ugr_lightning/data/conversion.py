@@ -1,8 +1,11 @@
 """Writing demonstrations again in another format: whole episodes only, and a second run goes on with the first."""
 
+import fcntl
 import hashlib
 import json
-from collections.abc import Callable, Sequence
+import os
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -63,13 +66,30 @@ def convert(
     note = _describe(found, source, to)
     _check_note(target, note)
     try:
-        publish_text(target / NOTE, json.dumps(note, indent=2) + "\n")
-        form.write(target, found, lambda index: done("writing", index + 1, len(found)))
-        _check_written(form, target, found, done)
+        with _alone(target):
+            publish_text(target / NOTE, json.dumps(note, indent=2) + "\n")
+            form.write(target, found, lambda index: done("writing", index + 1, len(found)))
+            _check_written(form, target, found, done)
     except OSError as error:
         fix = "Make room, or choose another folder; the same command goes on."
         raise DataError(target, "a folder that can be written", str(error), fix) from error
     return found
+
+
+@contextmanager
+def _alone(target: Path) -> Iterator[None]:
+    """Only one process at a time converts into a folder; the lock goes with its holder, however that ends."""
+    target.mkdir(parents=True, exist_ok=True)
+    folder = os.open(target, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            expected, got = "a folder that nobody else writes", "another conversion at work in it"
+            raise DataError(target, expected, got, "Wait until it ends.") from error
+        yield
+    finally:
+        os.close(folder)
 
 
 def _check_target(source: Path, target: Path) -> None:

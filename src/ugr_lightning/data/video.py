@@ -12,8 +12,11 @@ from ugr_lightning.data.frames import MAX_PIXELS, FrameSource
 from ugr_lightning.errors import DataError, missing_extra
 
 FIX = "Copy the dataset again, or leave this episode out."
-ENCODING = {"preset": "veryfast", "crf": "18", "g": "2", "bf": "0"}
-"""H.264 that shows no loss to the eye; every second frame can be jumped to."""
+ENCODING = {"preset": "veryfast", "crf": "18", "g": "2", "bf": "0", "mbtree": "0", "rc-lookahead": "0"}
+"""H.264 that shows no loss to the eye; every second frame can be jumped to, so that looking ahead would gain nothing.
+
+It would cost sameness: x264 165 with AVX-512 then encodes the same pictures otherwise once in a while.
+"""
 AHEAD = 8  # frames that are decoded rather than jumped over
 
 
