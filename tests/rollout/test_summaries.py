@@ -10,10 +10,9 @@ from ugr_lightning.rollout.results import summarize
 from ugr_lightning.rollout.summaries import read_evaluations, read_summary, write_summary
 
 
-def episode(seed, execution, success, crash=None):
-    return EpisodeResult(
-        "click_alarmclock", "demo_clean", seed, "hash", "ACT", "abc", execution, success, 9, crash=crash
-    )
+def episode(seed, execution, success, crash=None, sha="abc"):
+    about = ("click_alarmclock", "demo_clean", seed, "hash", "ACT", sha)
+    return EpisodeResult(*about, execution, success, 9, crash=crash)
 
 
 @pytest.fixture
@@ -79,4 +78,18 @@ def test_a_broken_line_is_named(tmp_path, evaluations):
     write_summary(evaluations, path)
     path.write_text(path.read_text()[:-40])
     with pytest.raises(DataError, match="line 4"):
+        read_summary(path)
+
+
+def test_files_of_unknown_training_seeds_stay_apart(tmp_path):
+    found = [Evaluation("ACT", None, Path(name), [episode(1, "25", True, sha=name)]) for name in ("a", "b")]
+    write_summary(found, tmp_path / "summary.jsonl")
+    assert [len(item.results) for item in read_summary(tmp_path / "summary.jsonl")] == [1, 1]
+
+
+def test_nothing_counts_twice(tmp_path, evaluations):
+    path = tmp_path / "summary.jsonl"
+    write_summary(evaluations, path)
+    path.write_text(path.read_text() + path.read_text().splitlines()[0])
+    with pytest.raises(DataError, match="line 5"):
         read_summary(path)

@@ -67,11 +67,17 @@ def read_summary(path: Path) -> list[Evaluation]:
         lines = path.read_text().splitlines()
     except (OSError, ValueError) as error:
         raise DataError(path, "a summary of evaluations", str(error), FIX) from error
-    found: dict[tuple[str, Any], Evaluation] = {}
+    found: dict[tuple[Any, ...], Evaluation] = {}  # one for each checkpoint: not every training seed is known
+    places = set()
     for number, line in enumerate(lines, start=1):
-        about = _checked(f"{path}, line {number}", line)
-        key = (about["policy"], about["training_seed"])
-        item = found.setdefault(key, Evaluation(*key, path, [], {}))
+        where = f"{path}, line {number}"
+        about = _checked(where, line)
+        key = (about["policy"], about["training_seed"], about["checkpoint"])
+        place = (*key, about["task"], about["setting"], about["execution"])
+        if place in places:
+            raise DataError(where, "each checkpoint, task, setting and execution once", "this one again", FIX)
+        places.add(place)
+        item = found.setdefault(key, Evaluation(about["policy"], about["training_seed"], path, [], {}))
         item.results.extend(_episodes(about))
         item.modes[about["execution"]] = about["mode"]
     return list(found.values())
