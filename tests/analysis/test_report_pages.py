@@ -27,6 +27,30 @@ def test_markdown_has_a_row_for_every_rate_and_comparison():
     assert re.search(r"\| `base` \| \d+/60 = [\d.]+% \| \[[\d.]+%, [\d.]+%\] \| 0: \d+/30, 1: \d+/30 \| 0 \|", text)
 
 
+def overview(report):
+    section = to_markdown(report, "t").split("## Overview\n\n")[1].split("\n\n")[0]
+    return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in section.splitlines()]
+
+
+def test_the_overview_has_a_row_for_every_policy_and_execution():
+    head, _, *rows = overview(table2())
+    assert head == ["policy", "setting and execution", "click_alarmclock"]
+    assert [row[0] for row in rows] == ["`base`", "`uncert`", "`<b>\\|`"]
+    base = table2().rates[0].total
+    assert rows[0][2] == f"{base.successes}/60 [{100 * base.low:.1f}, {100 * base.high:.1f}]"
+
+
+def test_the_overview_adds_up_tasks_only_where_all_have_as_many_episodes():
+    even = [drawn("a", 0.5, n=20, seed=task == "handover_block", task=task) for task in ("mug", "handover_block")]
+    head, _, row = overview(build_report(even))
+    assert head[2:] == ["mug", "handover_block", "all tasks"]
+    assert row[4].startswith(f"{sum(int(cell.split('/')[0]) for cell in row[2:4])}/40 [")
+    uneven = build_report([even[0], drawn("a", 0.5, n=10, task="handover_block")])
+    assert overview(uneven)[2][4] == ""
+    missing = overview(build_report([*even, drawn("b", 0.5, n=20, task="mug")]))
+    assert missing[3][3:] == ["", ""]
+
+
 class Page(HTMLParser):
     def __init__(self, text):
         super().__init__()

@@ -383,6 +383,35 @@ def test_the_coarse_weight_multiplies_the_coarse_loss_alone(tiny, batch):
     assert torch.isclose(second["loss"] - first["loss"], first["coarse"], rtol=1e-4)
 
 
+def test_held_out_episodes_teach_the_uncertainty_and_the_others_everything_else(tiny, batch):
+    policy = noisy_branch(tiny(refine=Uncertainty(), uncertainty_holdout=2))
+
+    def learned_from(held_out):
+        policy.zero_grad()
+        episode = torch.full_like(batch.episode, 4 if held_out else 5)
+        terms = policy.losses(batch._replace(episode=episode))
+        (terms["loss"] - policy.kl_weight * terms["kl"]).backward()
+        return {name for name, p in policy.named_parameters() if p.grad is not None and p.grad.any()}
+
+    head = {"uncertainty_head.weight", "uncertainty_head.bias"}
+    assert learned_from(held_out=True) == head
+    others = learned_from(held_out=False)
+    assert others.isdisjoint(head)
+    assert {"action_head.weight", "branch.head.weight", "query_embed", "state_proj.weight"} <= others
+
+
+def test_holding_episodes_out_changes_neither_validation_nor_predictions(tiny, batch):
+    plain, other = (tiny(refine=Uncertainty(), uncertainty_holdout=n).eval() for n in (0, 2))
+    assert plain.losses(batch) == other.losses(batch)
+    assert torch.equal(plain.predict(batch.observation).log_variance, other.predict(batch.observation).log_variance)
+
+
+@pytest.mark.parametrize(("n", "refine"), [(1, Uncertainty()), (-5, Uncertainty()), (5, Full()), (5, None)])
+def test_holding_out_all_episodes_or_those_of_no_uncertainty_is_refused(tiny, n, refine):
+    with pytest.raises(ConfigError, match="uncertainty_holdout"):
+        tiny(refine=refine, uncertainty_holdout=n)
+
+
 def test_base_with_the_parameters_of_uncert_has_exactly_as_many_and_learns_through_the_branch(tiny, batch):
     control = tiny(refine=Full(), uncertainty_head=True, coarse_weight=0.0)
     assert parameters(control) == parameters(tiny(refine=Uncertainty()))

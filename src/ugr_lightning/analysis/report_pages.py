@@ -14,8 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ugr_lightning.analysis.conclusions import conclude, described_execution
-from ugr_lightning.analysis.report import ALL_TASKS, Contest, Rate, Report
+from ugr_lightning.analysis.report import ALL_TASKS, Contest, Mode, Rate, Report
 from ugr_lightning.data.folder import publish_text
+from ugr_lightning.rollout.results import Summary, wilson_interval
 
 METHOD = (
     "Rates carry n and the 95 % Wilson interval over all episodes. Policies are compared on the seeds and training "
@@ -100,12 +101,14 @@ def to_html(report: Report, title: str) -> str:
 
 
 def sections(report: Report, figures: bool = False) -> list[Section]:
-    """The report's parts in order: conclusion, rates by mode, comparisons by mode, method."""
+    """The report's parts in order: conclusion, overview, rates by mode, comparisons by mode, method."""
     found = [Section("Conclusion", conclude(report).parts, report.remarks)]
+    if report.rates:
+        found.append(Section("Overview", table=_overview_table(report.rates)))
     for mode in dict.fromkeys(rate.mode for rate in report.rates):
         rates = [rate for rate in report.rates if rate.mode == mode]
         contests = [contest for contest in report.contests if contest.mode == mode]
-        place = f"{mode.setting}, {described_execution(mode.execution)}"
+        place = _described(mode)
         drawn = rates_figure(rates) if figures else ""
         found.append(Section(f"Success: {place}", table=_rate_table(rates), figure=drawn))
         if contests:
@@ -113,6 +116,33 @@ def sections(report: Report, figures: bool = False) -> list[Section]:
             found.append(Section(f"Comparisons: {place}", table=_contest_table(contests), figure=drawn))
     found.append(Section("Method", paragraphs=[METHOD]))
     return found
+
+
+def _described(mode: Mode) -> str:
+    return f"{mode.setting}, {described_execution(mode.execution)}"
+
+
+def _overview_table(rates: Sequence[Rate]) -> list[Sequence[str]]:
+    """A row per mode and policy, a column per task, and their sum where each task has as many episodes."""
+    tasks = list(dict.fromkeys(rate.task for rate in rates))
+    totals: dict[tuple[str, str], dict[str, Summary]] = {}
+    for rate in rates:
+        totals.setdefault((_described(rate.mode), rate.policy), {})[rate.task] = rate.total
+    several = len(tasks) > 1
+    rows: list[Sequence[str]] = [("policy", "setting and execution", *tasks, *([ALL_TASKS] if several else []))]
+    for (mode, policy), by_task in totals.items():
+        cells = [_counted(by_task[task].successes, by_task[task].n) if task in by_task else "" for task in tasks]
+        if several:
+            sizes = [total.n for total in by_task.values()]
+            whole = len(by_task) == len(tasks) and len(set(sizes)) == 1
+            cells.append(_counted(sum(t.successes for t in by_task.values()), sum(sizes)) if whole else "")
+        rows.append((f"`{policy}`", mode, *cells))
+    return rows
+
+
+def _counted(successes: int, n: int) -> str:
+    low, high = wilson_interval(successes, n)
+    return f"{successes}/{n} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
 def _rate_table(rates: Sequence[Rate]) -> list[Sequence[str]]:

@@ -69,6 +69,8 @@ class ACT(ChunkPolicy):
         decoder_readout: which decoder layer is read out: `last`, or `first` as the public ACT code does (then the
             other layers are not built).
         reconstruction: `mse`, summed over the action (paper), or `l1`, averaged over it (public ACT code).
+        uncertainty_holdout: n, for the uncertainty to be learned on episodes whose actions nothing else is trained on:
+            every n-th; 0 trains everything on all episodes, as in the paper.
         coarse_weight: factor on L_coarse, 1 in the paper; controls set it.
         kl_weight: lambda_KL.
         uncertainty_weight: lambda_u.
@@ -107,6 +109,7 @@ class ACT(ChunkPolicy):
         refine_branch: BranchName = "mlp",
         refine_detach_coarse: bool = False,
         uncertainty_head: bool = False,
+        uncertainty_holdout: int = 0,
         causal: bool = False,
         decoder_readout: Literal["last", "first"] = "last",
         reconstruction: Reconstruction = "mse",
@@ -145,11 +148,15 @@ class ACT(ChunkPolicy):
         if refine is not None and refine.offline:
             fix = "Compare with it offline: `ugr analyze --budgets`."
             raise ConfigError("refine", "a rule that knows what a policy knows", type(refine).__name__, fix)
+        wants_uncertainty = uncertainty_head or (refine is not None and refine.needs_uncertainty)
+        if uncertainty_holdout and (uncertainty_holdout < 2 or not wants_uncertainty):
+            fix = "Set it to 0, or to 5 for every fifth episode, with `uncertainty_head: true` if `refine` needs none."
+            raise ConfigError("uncertainty_holdout", "0, or 2 and more with an uncertainty", uncertainty_holdout, fix)
         self.cameras, self.chunk_length = tuple(cameras), chunk_length
         self.state_dim, self.action_dim, self.latent_dim = state_dim, action_dim, latent_dim
         self.refine, self.refine_detach_coarse, self.causal = refine, refine_detach_coarse, causal
         self.reconstruction, self.kl_weight, self.uncertainty_weight = reconstruction, kl_weight, uncertainty_weight
-        self.coarse_weight = coarse_weight
+        self.coarse_weight, self.uncertainty_holdout = coarse_weight, uncertainty_holdout
         self.state_dropout, self.state_noise = state_dropout, state_noise
         self.image_shift, self.color_jitter = image_shift, color_jitter
         self.position_in_values, self.precision = position_in_values, precision
@@ -178,7 +185,6 @@ class ACT(ChunkPolicy):
                 nn.init.xavier_uniform_(parameter)
 
         self.action_head = nn.Linear(dim, action_dim)
-        wants_uncertainty = uncertainty_head or (refine is not None and refine.needs_uncertainty)
         self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
         self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
         self.budget = refine.budget(chunk_length) if refine is not None else None
@@ -214,11 +220,12 @@ class ACT(ChunkPolicy):
         target = self.normalizer.action(batch.actions)  # (B, K, A)
         latent, posterior = self._encode_chunk(state, target, batch.valid)
         plan = self._plan(batch.images, state, latent, batch.valid)
-        terms = {"coarse": coarse_loss(plan.coarse, target, batch.valid, self.reconstruction)}
+        acting, doubting = self._lessons(batch)  # (B, K) each
+        terms = {"coarse": coarse_loss(plan.coarse, target, acting, self.reconstruction)}
         if plan.refined is not None:
-            terms["refine"] = refine_loss(plan.actions, target, plan.refined, batch.valid, self.reconstruction)
+            terms["refine"] = refine_loss(plan.actions, target, plan.refined, acting, self.reconstruction)
         if plan.log_variance is not None:
-            terms["uncertainty"] = uncertainty_loss(plan.coarse, target, plan.log_variance, batch.valid)
+            terms["uncertainty"] = uncertainty_loss(plan.coarse, target, plan.log_variance, doubting)
         if posterior is not None:
             terms["kl"] = kl_loss(*posterior)
         total = total_loss(
@@ -304,6 +311,13 @@ class ACT(ChunkPolicy):
             else:
                 residual = self.branch(hidden, start, self.query_embed, memory, memory_keys)  # (B, K, A), dA
         return Plan(start + refined[..., None] * residual, coarse, log_variance, refined)  # A_1 = A_0 + m * dA
+
+    def _lessons(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Which steps (B, K) teach the actions, and which the uncertainty; the same, unless episodes are held out."""
+        if not self.training or not self.uncertainty_holdout:
+            return batch.valid, batch.valid
+        held_out = (batch.episode % self.uncertainty_holdout == 0)[:, None]  # (B, 1)
+        return batch.valid & ~held_out, batch.valid & held_out
 
     def _encode_chunk(
         self, state: Tensor, actions: Tensor, valid: Tensor
