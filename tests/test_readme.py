@@ -15,6 +15,7 @@ from ugr_lightning.models.refine.selector import Selector
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PACKAGE = ROOT / "src" / "ugr_lightning"
+RESULTS = sorted((ROOT / "docs" / "results").iterdir())
 
 each_page = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
@@ -145,6 +146,15 @@ def test_python_examples_are_valid(page):
     for block in read(page).blocks:
         if block.language == "python":
             ast.parse(block.text)
+
+
+@pytest.mark.parametrize("folder", RESULTS, ids=lambda folder: folder.name)
+def test_a_published_report_is_what_its_episodes_give(folder, capsys):
+    assert main.main(["report", str(folder)]) == 0
+    report = (folder / "report.md").read_text()
+    assert capsys.readouterr().out == report
+    overview = report.split("## Overview\n\n")[1].split("\n\n")[0]
+    assert overview in (ROOT / "README.md").read_text(), f"README.md shows other rates than {folder}"
 
 
 def test_the_selector_of_the_readme_selects():

@@ -184,6 +184,7 @@ def test_results_say_what_they_are_of(calls):
     assert (info.policy, info.task, info.training_seed) == ("base", "click_alarmclock", 0)
     assert info.checkpoint == f"runs/{NAME}/version_0/policy_best.ckpt"
     assert info.modes == {"2": "as published"}
+    assert info.job == 0
     assert set(info.seconds) == {"fit", "test"}
     assert yaml.safe_load((folder / "config.yaml").read_text())["trainer"]["max_steps"] == 6
     assert Path("out/results/grid.yaml").read_text() == Path("grid.yaml").read_text()

@@ -34,6 +34,12 @@ def test_a_benchmark_is_read_from_its_folder_or_from_a_copy_of_its_results(bench
     assert read_benchmark(benchmark / "results") == found
 
 
+def test_evaluations_come_in_the_order_of_the_grid_and_those_that_do_not_say_it_last(benchmark):
+    for place, (policy, job) in enumerate((("zebra", 0), ("ant", 12), ("bee", 2))):
+        RunInfo(policy, "click_alarmclock", 0, "c0ffee", job=job).write(benchmark / "results" / str(place))
+    assert [item.policy for item in read_benchmark(benchmark)] == ["zebra", "bee", "ant", "base", "uncert"]
+
+
 def test_run_info_survives_its_file(tmp_path):
     info = RunInfo("base", "click_alarmclock", 0, "c0ffee", "runs/a", "runs/a/x.ckpt", "abc", {"fit": 2.0})
     info.write(tmp_path)

@@ -197,7 +197,7 @@ class Benchmark:
             info = RunInfo(job.policy, job.task, job.training_seed, fingerprint(config))
             text = yaml.safe_dump(config, sort_keys=False)
             publish_text(path, text)
-        info.modes = job.modes
+        info.modes, info.job = job.modes, job.index
         info.write(place)
         return info
 

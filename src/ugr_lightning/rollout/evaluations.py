@@ -29,6 +29,7 @@ class RunInfo:
         checkpoint_sha256: of that file.
         seconds: wall-clock seconds by part (`fit`, `test`), over all attempts.
         modes: by execution as results say it, the name under which it is compared where that is another one.
+        job: its place in the grid; reports keep this order.
     """
 
     policy: str
@@ -40,6 +41,7 @@ class RunInfo:
     checkpoint_sha256: str | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     modes: dict[str, str] = field(default_factory=dict)
+    job: int | None = None
 
     def write(self, folder: Path) -> None:
         """Write `run.json` into a folder, aside first."""
@@ -83,7 +85,7 @@ class Evaluation:
 
 
 def read_benchmark(folder: str | Path) -> list[Evaluation]:
-    """The evaluations of a folder that `ugr benchmark` writes, or of a copy of its `results`.
+    """The evaluations of a folder that `ugr benchmark` writes, or of a copy of its `results`, in the grid's order.
 
     Raises:
         DataError: there are none, or a file is damaged; names the file and the line.
@@ -94,8 +96,8 @@ def read_benchmark(folder: str | Path) -> list[Evaluation]:
         fix = "Give a results folder of `ugr benchmark`, or single files with --runs NAME=FILE."
         raise DataError(folder, f"folders with {RUN_FILE}", "none", fix)
     evaluations = []
-    for place in found:
-        info = RunInfo.read(place)
+    infos = [(place, RunInfo.read(place)) for place in found]
+    for place, info in sorted(infos, key=lambda item: (item[1].job is None, item[1].job or 0)):
         path = place / RESULTS_FILE
         results = _once(path, read_results(path)) if path.is_file() else []
         wrong = {item.checkpoint for item in results} - {info.checkpoint_sha256}
