@@ -100,6 +100,20 @@ def test_a_bound_is_rounded_up():
     assert "differ by less than 1%" in may
 
 
+def test_many_comparisons_that_show_nothing_share_a_sentence_and_one_that_shows_something_has_its_own():
+    rates = {"a": 0.9, "b": 0.9, "c": 0.9, "d": 0.9, "worse": 0.5}
+    conclusion = conclude(build_report([drawn(name, rate, n=400, seed=1) for name, rate in rates.items()]))
+    assert sum("succeeds more often than `worse`" in sentence for sentence in conclusion.may) == 4
+    (shared,) = [sentence for sentence in conclusion.may if "show no difference" in sentence]
+    assert shared.startswith("6 pairs differ by less than 1% each in click_alarmclock")
+    assert all(pair in shared for pair in ("`b` - `a` +0.0%", "`d` - `c` +0.0%"))
+    few = conclude(build_report([drawn(name, 0.9, n=20, seed=i) for i, name in enumerate("abcd")]))
+    (shared, _, _) = few.may_not
+    assert shared.startswith("Which is better in click_alarmclock")
+    assert "6 pairs that may differ by 10% or more" in shared
+    assert "n = 20 seeds, no p below" in shared
+
+
 def test_every_execution_is_put_into_words():
     runs = [evaluation(p, [1, 0] * 50, execution="aggregate-variance") for p in ("base", "uncert")]
     assert "chunks aggregated with inverse variance" in words(*runs)[0]

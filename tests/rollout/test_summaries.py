@@ -44,6 +44,13 @@ def test_what_comparisons_need_survives_the_file(evaluations, tmp_path):
     assert [summarize(item.results) for item in again] == [summarize(item.results) for item in evaluations]
 
 
+def test_executions_keep_their_order_and_seeds_are_sorted(tmp_path):
+    mixed = [episode(3, "aggregate", True), episode(1, "25", True), episode(2, "aggregate", True)]
+    write_summary([Evaluation("ACT", 0, Path("a"), mixed)], tmp_path / "summary.jsonl")
+    again = [(r.execution, r.seed) for item in read_evaluations(tmp_path) for r in item.results]
+    assert again == [("aggregate", 2), ("aggregate", 3), ("25", 1)]
+
+
 def test_an_episode_of_the_table_takes_a_few_bytes(tmp_path):
     found = [episode(100_000 + seed, "25", seed % 3 > 0) for seed in range(100)]
     write_summary([Evaluation("ACT", 0, Path("a"), found)], tmp_path / "summary.jsonl")

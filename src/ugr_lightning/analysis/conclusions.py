@@ -12,6 +12,8 @@ LEVEL = 0.05
 MARGIN = 0.10
 """Comparisons that leave room for a larger difference than this have too few episodes to say that there is none."""
 ENOUGH_TRAINING_SEEDS = 3
+FEW = 3
+"""Up to so many comparisons that show nothing get a sentence each; more of them share one."""
 MAY, MAY_NOT = "What may be concluded:", "What may not:"
 
 
@@ -46,8 +48,11 @@ def conclude(report: Report) -> Conclusion:
     may_not: list[str] = []
     pooled = {contest.mode for contest in report.contests if contest.task == ALL_TASKS}
     decisive = [c for c in report.contests if (c.task == ALL_TASKS) == (c.mode in pooled)]
-    for contest in decisive:
-        (may if _differs(contest) or _is_close(contest) else may_not).append(_verdict(contest))
+    for place in dict.fromkeys((c.mode, c.task) for c in decisive):
+        contests = [c for c in decisive if (c.mode, c.task) == place]
+        may += [_verdict(c) for c in contests if _differs(c)]
+        may += _verdicts([c for c in contests if not _differs(c) and _is_close(c)])
+        may_not += _verdicts([c for c in contests if not _differs(c) and not _is_close(c)])
     may += _single_tasks([c for c in report.contests if c not in decisive])
     if not decisive:
         may_not.append(_nothing_to_compare(report))
@@ -75,16 +80,34 @@ def _verdict(contest: Contest) -> str:
         won = _from_the_winner(contest)
         return f"`{won.a}` succeeds more often than `{won.b}` {_where(won)}: {_numbers(won)}. {_again(won)}"
     if _is_close(contest):
-        percent = math.ceil(100 * _largest(contest) - 1e-9)  # rounding down would claim too much
         return (
-            f"`{contest.a}` and `{contest.b}` differ by less than {percent}% {_where(contest)}, and no difference "
-            f"is shown: {_numbers(contest)}."
+            f"`{contest.a}` and `{contest.b}` differ by less than {_bound([contest])} {_where(contest)}, and no "
+            f"difference is shown: {_numbers(contest)}."
         )
     return (
         f"Whether `{contest.a}` or `{contest.b}` is better {_where(contest)}: {_numbers(contest)}; anything from "
         f"{contest.low:+.0%} to {contest.high:+.0%} is compatible with these episodes, which are too few."
         f"{_needed(contest)}"
     )
+
+
+def _verdicts(contests: list[Contest]) -> list[str]:
+    """On comparisons of one mode and task that show no difference, either all close or all open."""
+    if len(contests) <= FEW:
+        return [_verdict(contest) for contest in contests]
+    where, count = _where(contests[0]), len(contests)
+    pairs = ", ".join(f"`{c.a}` - `{c.b}` {c.difference:+.1%} [{c.low:+.1%}, {c.high:+.1%}]" for c in contests)
+    shown = (
+        f"{pairs}; n = {', '.join(dict.fromkeys(map(_seeds, contests)))}, no p below "
+        f"{min(c.p_holm for c in contests):.3g} after correction."
+    )
+    if _is_close(contests[0]):
+        return [f"{count} pairs differ by less than {_bound(contests)} each {where}, and show no difference: {shown}"]
+    return [f"Which is better {where} of {count} pairs that may differ by {MARGIN:.0%} or more: {shown}"]
+
+
+def _bound(contests: list[Contest]) -> str:
+    return f"{math.ceil(100 * max(map(_largest, contests)) - 1e-9)}%"  # rounding down would claim too much
 
 
 def _from_the_winner(c: Contest) -> Contest:
@@ -107,14 +130,16 @@ def described_execution(execution: str) -> str:
 
 
 def _numbers(contest: Contest) -> str:
-    seeds = f"{contest.seeds} seeds"
-    if contest.training_seeds > 1:
-        seeds += f" x {contest.training_seeds} training seeds"
     return (
         f"{contest.rate_a:.1%} against {contest.rate_b:.1%}, difference {contest.difference:+.1%} "
-        f"[{contest.low:+.1%}, {contest.high:+.1%}], n = {seeds}, {contest.only_a} against {contest.only_b} episodes, "
-        f"p = {contest.p_holm:.3g} after correction"
+        f"[{contest.low:+.1%}, {contest.high:+.1%}], n = {_seeds(contest)}, {contest.only_a} against {contest.only_b} "
+        f"episodes, p = {contest.p_holm:.3g} after correction"
     )
+
+
+def _seeds(contest: Contest) -> str:
+    several = f" x {contest.training_seeds} training seeds" if contest.training_seeds > 1 else ""
+    return f"{contest.seeds} seeds{several}"
 
 
 def _again(contest: Contest) -> str:

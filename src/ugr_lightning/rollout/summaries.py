@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Iterable
-from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -35,9 +34,11 @@ def write_summary(evaluations: Iterable[Evaluation], path: Path) -> None:
     """
     lines = []
     for item in evaluations:
-        ordered = sorted(item.results, key=lambda r: (r.task, r.setting, r.execution, r.seed))
-        for (task, setting, execution), found in groupby(ordered, key=lambda r: (r.task, r.setting, r.execution)):
-            episodes = list(found)
+        groups: dict[tuple[str, str, str], list[EpisodeResult]] = {}  # in the order in which they were run
+        for result in item.results:
+            groups.setdefault((result.task, result.setting, result.execution), []).append(result)
+        for (task, setting, execution), found in groups.items():
+            episodes = sorted(found, key=lambda r: r.seed)
             about = {
                 "policy": item.policy,
                 "training_seed": item.training_seed,
