@@ -7,11 +7,22 @@ from ugr_lightning.analysis.failure import (
     auroc,
     conformal_threshold,
     detect_failures,
+    overlap_score,
     running_maximum,
-    step_scores,
+    scores_until,
+    uncertainty_score,
 )
 from ugr_lightning.errors import DataError
-from ugr_lightning.rollout.traces import UncertaintyTrace
+from ugr_lightning.rollout.traces import PredictionTrace
+
+
+def trace(seed, success, steps, query, *, chunks=None, log_variance=None):
+    empty = np.zeros((len(query), 0))
+    chunks = np.zeros((len(query), 5, 2)) if chunks is None else chunks
+    contacts = np.zeros((steps + 1, 2), bool)
+    return PredictionTrace(
+        seed, success, steps, query, chunks, empty if log_variance is None else log_variance, contacts
+    )
 
 
 def episodes(good, bad, rise=0.0, seed=0):
@@ -25,7 +36,7 @@ def episodes(good, bad, rise=0.0, seed=0):
         log_variance = rng.normal(size=(len(query), 15)) * 0.1 + rng.normal() * 0.1
         if not success:
             log_variance += rise * (query >= 20)[:, None]
-        made.append(UncertaintyTrace(index, success, steps, query, log_variance, np.zeros((steps + 1, 2), bool)))
+        made.append(trace(index, success, steps, query, log_variance=log_variance))
     return made
 
 
@@ -54,9 +65,36 @@ def test_the_maximum_runs_over_a_moving_average():
 
 
 def test_only_queries_in_time_and_the_near_steps_of_a_chunk_count():
-    trace = UncertaintyTrace(0, True, 8, np.array([0, 4]), np.array([[1.0, 3, 100], [9, 9, 9]]), np.zeros((9, 2), bool))
-    assert step_scores(trace, 4, 2).tolist() == [2]
-    assert step_scores(trace, 5, 2).tolist() == [2, 9]
+    log_variance = np.repeat([[2.0], [9.0]], 15, axis=1)
+    log_variance[:, 10:] = 100
+    one = trace(0, True, 8, np.array([0, 4]), log_variance=log_variance)
+    assert [part.tolist() for part in scores_until(one, uncertainty_score, 4)] == [[0], [2]]
+    assert [part.tolist() for part in scores_until(one, uncertainty_score, 5)] == [[0, 4], [2, 9]]
+
+
+def test_chunks_that_disagree_with_earlier_ones_score_high_and_a_first_one_has_no_score():
+    path = np.arange(12.0)[:, None]  # (steps, A)
+    chunks = np.stack([path[step : step + 5] for step in (0, 2, 4)])  # all say the same
+    query = np.array([0, 2, 4])
+    chunks[2] += 6
+    asked, scores = scores_until(trace(0, True, 8, query, chunks=chunks), overlap_score(np.array([2.0])), 8)
+    assert asked.tolist() == [2, 4]
+    assert scores.tolist() == [0, 3]  # 6, in standard deviations of 2
+
+
+def test_an_alarm_by_overlap_needs_no_uncertainty():
+    rng = np.random.default_rng(0)
+    made = []
+    for seed in range(40):
+        wander = rng.normal(size=(30, 5, 2)) * (0.1 if seed < 30 else 3.0)
+        made.append(trace(seed, seed < 30, 30, np.arange(30), chunks=wander))
+    assert detect_failures(made, overlap_score(np.ones(2))).auroc.value == 1
+
+
+def test_an_episode_without_any_score_raises_no_alarm():
+    short = [trace(seed, seed < 30, 9, np.arange(1 if seed % 2 else 9)) for seed in range(40)]
+    found = detect_failures(short, overlap_score(np.ones(2)))
+    assert (found.detected, found.false_alarms) == (0, 0)
 
 
 def test_failures_that_grow_uncertain_are_detected_early():

@@ -68,11 +68,16 @@ def test_failures_are_told_from_traces_of_this_checkpoint_alone(command, capsys,
         success, query = seed < 20, np.arange(40)
         arrays = {"seed": seed, "success": success, "steps": 40, "query": query, "contacts": np.zeros((41, 2), bool)}
         scores = np.full((40, 5), 0.01 * seed if success else 1.0)
+        arrays["chunks"] = np.full((40, 5, 14), 0.1) * query[:, None, None] * (1 + seed if success else 0)
         np.savez(tmp_path / f"click_alarmclock-{sha}-TinyPolicy-25-{seed}.npz", **arrays, log_variance=scores)
     assert main([*command, "--traces", str(tmp_path)]) == 0
     assert "100% of 10 failures" in capsys.readouterr().out
     found = json.loads((tmp_path / "analysis-policy_best" / "analysis.json").read_text())
-    assert found["failures"][f"click_alarmclock-{sha}-TinyPolicy-25"]["auroc"]["value"] == 1
+    by_uncertainty, by_overlap = found["failures"].values()
+    assert list(found["failures"]) == [
+        f"click_alarmclock-{sha}-TinyPolicy-25, {by}" for by in ("s_k", "overlapping chunks")
+    ]
+    assert (by_uncertainty["auroc"]["value"], by_overlap["auroc"]["value"]) == (1, 0)  # here successes wander
 
 
 @pytest.mark.parametrize(("option", "says"), [("--budgets", "ranks"), ("--estimators", "ACT")])

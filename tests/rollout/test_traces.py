@@ -26,8 +26,23 @@ def test_a_trace_says_when_the_policy_was_asked_and_what_it_answered(written):
         assert (trace.steps, trace.success) == (result.steps, result.success)
         assert trace.query.tolist() == list(range(0, result.steps, 2))
         assert trace.log_variance.shape == (len(trace.query), 5)
+        assert trace.chunks.shape == (len(trace.query), 5, 14)
         assert trace.log_variance[0].tolist() == [-1, -2, -3, -4, -5]
         assert trace.contacts.shape == (trace.steps + 1, 2)
+
+
+def test_a_policy_without_uncertainty_leaves_its_chunks(tmp_path):
+    class Silent(Reacher):
+        def predict(self, observation):
+            return super().predict(observation)._replace(log_variance=None)
+
+    options = {"simulator": FakeSimulator, "image_size": (4, 6), "progress": False, "workers": 1}
+    run_episodes(
+        Silent(), "reach", [4], **options, on_result=lambda result, trace: write_trace(tmp_path, result, trace)
+    )
+    (trace,) = read_traces(tmp_path.glob("*.npz"))
+    assert trace.chunks.shape == (trace.steps, 5, 14)
+    assert trace.log_variance.shape == (trace.steps, 0)
 
 
 def test_a_damaged_trace_is_named(written):

@@ -1,22 +1,26 @@
-"""Runtime failure detection: whether the policy's uncertainty warns before an episode fails.
+"""Runtime failure detection: whether what a policy predicts warns before an episode fails.
 
 A conformal threshold is set on successful episodes, so that a new successful one raises an alarm with at most a chosen
 probability; the others, held out, show how many failures it catches and how early.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import mannwhitneyu
 
 from ugr_lightning.analysis.calibration import Interval
+from ugr_lightning.analysis.estimators import disagreement
 from ugr_lightning.errors import DataError
-from ugr_lightning.rollout.traces import UncertaintyTrace
+from ugr_lightning.rollout.traces import PredictionTrace
 
 HORIZON = 10
 """Steps of a chunk that a step's score looks ahead."""
+
+Score = Callable[[PredictionTrace], np.ndarray]
+"""What an alarm goes by: (Q,), a number for each query, higher where more trouble is expected; NaN if unknown."""
 
 
 class Alarms(NamedTuple):
@@ -52,23 +56,48 @@ class Alarms(NamedTuple):
         )
 
 
-def step_scores(trace: UncertaintyTrace, until: int, horizon: int = HORIZON) -> np.ndarray:
-    """The uncertainty of the near future at each query: mean of s_k over the first steps of the chunk.
+def uncertainty_score(trace: PredictionTrace) -> np.ndarray:
+    """What the policy says of the near future: mean of s_k over the first steps of each chunk, (Q,)."""
+    return trace.log_variance[:, :HORIZON].mean(1)
+
+
+def overlap_score(std: np.ndarray) -> Score:
+    """How far the first steps of a chunk are from what earlier chunks said about the same moments; any policy has it.
+
+    Args:
+        std: (A,) standard deviation of the actions.
+    """
+
+    def score(trace: PredictionTrace) -> np.ndarray:
+        chunks = trace.chunks.astype(np.float64) / std  # (Q, K, A)
+        distance = disagreement(chunks, np.zeros(len(chunks)), trace.query)[:, :HORIZON]  # (Q, HORIZON)
+        known = ~np.isnan(distance)
+        return np.where(known, distance, 0.0).sum(1) / np.where(known.any(1), known.sum(1), np.nan)  # (Q,)
+
+    return score
+
+
+def scores_until(trace: PredictionTrace, score: Score, until: int) -> tuple[np.ndarray, np.ndarray]:
+    """The queries of an episode that have a score, and their scores.
 
     Args:
         trace: one episode.
+        score: what the alarm goes by.
         until: control steps that count. An episode ends when it succeeds, so that failures are longer, and a maximum
             over more steps is higher by itself: compare all episodes over the same time.
-        horizon: steps of the chunk.
 
     Returns:
-        (Q',) scores of the queries before `until`.
+        (Q',) control steps and (Q',) scores, of the queries before `until`.
     """
-    return trace.log_variance[trace.query < until, :horizon].mean(1)
+    values = score(trace)
+    counts = (trace.query < until) & ~np.isnan(values)
+    return trace.query[counts], values[counts]
 
 
 def running_maximum(scores: np.ndarray, window: int = 5) -> np.ndarray:
     """Highest average of `window` queries so far, (Q,), -inf before the first: a single uncertain query is no alarm."""
+    if not len(scores):
+        return np.empty(0)
     width = min(window, len(scores))
     smooth = np.convolve(scores, np.ones(width) / width, mode="valid")  # (Q - width + 1,)
     return np.maximum.accumulate(np.concatenate([np.full(width - 1, -np.inf), smooth]))
@@ -104,7 +133,12 @@ def auroc(failed: np.ndarray, succeeded: np.ndarray) -> float:
 
 
 def detect_failures(
-    traces: Sequence[UncertaintyTrace], *, level: float = 0.1, seed: int = 0, resamples: int = 500
+    traces: Sequence[PredictionTrace],
+    score: Score = uncertainty_score,
+    *,
+    level: float = 0.1,
+    seed: int = 0,
+    resamples: int = 500,
 ) -> Alarms:
     """Set a threshold on half of the successful episodes and try it on all other episodes.
 
@@ -113,6 +147,7 @@ def detect_failures(
 
     Args:
         traces: episodes of one policy, task and execution, each seed once.
+        score: what the alarm goes by.
         level: largest probability of an alarm in a successful episode.
         seed: of the halves and of the bootstrap.
         resamples: draws of the bootstrap over episodes.
@@ -129,14 +164,15 @@ def detect_failures(
     rng = np.random.default_rng(seed)
     order = rng.permutation(len(good))
     half = len(good) // 2
-    paths = [[running_maximum(step_scores(trace, until)) for trace in part] for part in (good, bad)]
-    highest_good, highest_bad = (np.array([path[-1] for path in part]) for part in paths)
+    scored = [[scores_until(trace, score, until) for trace in part] for part in (good, bad)]
+    paths = [[running_maximum(values) for _, values in part] for part in scored]
+    highest_good, highest_bad = (np.array([path[-1] if len(path) else -np.inf for path in part]) for part in paths)
     threshold = conformal_threshold(highest_good[order[:half]], level)
     held_out = highest_good[order[half:]]
     leads = [
-        trace.steps - int(trace.query[int(np.argmax(path > threshold))])
-        for trace, path in zip(bad, paths[1], strict=True)
-        if path[-1] > threshold
+        trace.steps - int(query[int(np.argmax(path > threshold))])
+        for trace, (query, _), path in zip(bad, scored[1], paths[1], strict=True)
+        if (path > threshold).any()
     ]
     draws = [
         auroc(rng.choice(highest_bad, len(highest_bad)), rng.choice(held_out, len(held_out))) for _ in range(resamples)

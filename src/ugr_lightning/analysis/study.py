@@ -13,8 +13,8 @@ from ugr_lightning.analysis.budgets import sweep, sweep_figure, sweep_table
 from ugr_lightning.analysis.calibration_figures import calibration_figure, event_figure
 from ugr_lightning.analysis.estimators import estimate, estimator_table
 from ugr_lightning.analysis.events import KINDS, find_events
-from ugr_lightning.analysis.failure import detect_failures
-from ugr_lightning.analysis.predictions import Predictions, predict
+from ugr_lightning.analysis.failure import Score, detect_failures, overlap_score, uncertainty_score
+from ugr_lightning.analysis.predictions import STD_FLOOR, Predictions, predict
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.folder import publish, publish_text
@@ -177,7 +177,7 @@ def add_estimators(study: Study) -> None:
 
 
 def add_failures(study: Study, folder: Path) -> None:
-    """Add whether s_k warned before episodes failed, for each task and execution with traces of this checkpoint.
+    """Add whether s_k, or chunks that disagree, warned before episodes failed, for each execution with traces.
 
     Args:
         study: of the checkpoint.
@@ -192,7 +192,14 @@ def add_failures(study: Study, folder: Path) -> None:
     if not groups:
         fix = "Make some with `ugr rollout --policy CKPT --seeds selection --traces FOLDER`."
         raise DataError(folder, "traces of this checkpoint", "none", fix)
-    found = {name: detect_failures(read_traces(paths)) for name, paths in groups.items()}
+    std = study.data.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
+    scores: dict[str, Score] = {"s_k": uncertainty_score, "overlapping chunks": overlap_score(std)}
+    traces = {name: read_traces(paths) for name, paths in groups.items()}
+    found = {
+        f"{name}, {by}": detect_failures(episodes, score)
+        for name, episodes in traces.items()
+        for by, score in scores.items()
+    }
     study.content["failures"] = found
     study.sentences += [f"{name}: {alarms}" for name, alarms in found.items()]
 

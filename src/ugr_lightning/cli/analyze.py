@@ -40,7 +40,8 @@ def _analyze(
         resamples: draws of the bootstrap over episodes.
         budgets: also the error when from none to all of the steps are refined, chosen by s_k and by its rivals.
         estimators: also other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
-        traces: folder that `ugr rollout --traces` filled; says whether s_k warned before episodes failed.
+        traces: folder that `ugr rollout --traces` filled; says whether s_k, or chunks that disagree, warned
+            before episodes failed.
         out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
     """
     from ugr_lightning.analysis import study as kit

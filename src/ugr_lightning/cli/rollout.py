@@ -45,7 +45,7 @@ def _rollout(
         workers: simulator processes.
         video: file for an animated GIF of the first episode.
         out: results file, one JSON line per episode is appended.
-        traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
+        traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
     """
     from ugr_lightning.rollout.results import success_table
@@ -237,7 +237,7 @@ def _test(
             `aggregate` and 25, or the whole chunk where it is shorter.
         workers: simulator processes.
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
-        traces: folder for the predicted uncertainty of each episode, one `.npz` file each.
+        traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
         resume: run only the episodes that the results file lacks.
     """

@@ -21,10 +21,12 @@ class Decision(NamedTuple):
 
     Args:
         action: (14,) command; None leaves it to the expert in the simulator.
-        log_variance: (K,) s_k of the chunk that was predicted in this step; None where there is none.
+        chunk: (K, A) that was predicted in this step; None where there is none.
+        log_variance: (K,) s_k of that chunk; None where there is none.
     """
 
     action: np.ndarray | None
+    chunk: np.ndarray | None = None
     log_variance: np.ndarray | None = None
 
 
@@ -195,14 +197,13 @@ class PolicyActor(Actor):
         for slot, frame in frames.items():
             self._see(slot, frame)
         asking = [slot for slot in sorted(frames) if self._execution.needs_query(slot)]
-        uncertainty: dict[int, np.ndarray] = {}
+        predicted: dict[int, tuple[np.ndarray, np.ndarray | None]] = {}
         if asking:
             chunks, log_variance = self._query(asking)
             for row, slot in enumerate(asking):
-                if log_variance is not None:
-                    uncertainty[slot] = log_variance[row]
-                self._execution.push(slot, chunks[row], uncertainty.get(slot))
-        return {slot: Decision(self._execution.next(slot), uncertainty.get(slot)) for slot in frames}
+                predicted[slot] = chunks[row], None if log_variance is None else log_variance[row]
+                self._execution.push(slot, *predicted[slot])
+        return {slot: Decision(self._execution.next(slot), *predicted.get(slot, ())) for slot in frames}
 
     def looks(self, slot: int) -> bool:
         """Where a query is so near that it will have the next frame among its observations."""

@@ -29,12 +29,14 @@ class EpisodeTrace:
     Args:
         frames: N + 1 frames of the simulator; without their pictures unless the episode is filmed.
         actions: N commands (14,); None where the expert gave it.
-        log_variance: N items, s_k (K,) of the chunk predicted in that step or None.
+        chunks: N items, the chunk (K, A) predicted in that step or None.
+        log_variance: N items, its s_k (K,) or None.
         images: N + 1 items (V, H, W, 3) uint8 of a filmed episode, else empty.
     """
 
     frames: list[Any] = field(default_factory=list)
     actions: list[np.ndarray | None] = field(default_factory=list)
+    chunks: list[np.ndarray | None] = field(default_factory=list)
     log_variance: list[np.ndarray | None] = field(default_factory=list)
     images: list[np.ndarray] = field(default_factory=list)
 
@@ -166,6 +168,7 @@ class LockStep:
                 self._end(slot, fault)
                 continue
             episode.trace.actions.append(decisions[slot].action)
+            episode.trace.chunks.append(decisions[slot].chunk)
             episode.trace.log_variance.append(decisions[slot].log_variance)
             look = episode.filmed or self._actor.looks(slot)
             orders[slot] = Order(slot, action=decisions[slot].action, look=look)

@@ -13,15 +13,16 @@ from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.lockstep import EpisodeTrace
 
 
-class UncertaintyTrace(NamedTuple):
-    """The uncertainty of one episode over time.
+class PredictionTrace(NamedTuple):
+    """What was predicted in one episode, over time.
 
     Args:
         seed: simulator seed.
         success: whether the task was done.
         steps: control steps executed.
         query: (Q,) control steps at which a chunk was predicted.
-        log_variance: (Q, K) s_k of those chunks.
+        chunks: (Q, K, A) float16, robot units.
+        log_variance: (Q, K) s_k of those chunks; (Q, 0) for a policy without.
         contacts: (steps + 1, 2) bool, left and right fingers touch something.
     """
 
@@ -29,6 +30,7 @@ class UncertaintyTrace(NamedTuple):
     success: bool
     steps: int
     query: np.ndarray
+    chunks: np.ndarray
     log_variance: np.ndarray
     contacts: np.ndarray
 
@@ -40,22 +42,24 @@ def trace_path(folder: Path, result: EpisodeResult) -> Path:
 
 
 def write_trace(folder: Path, result: EpisodeResult, trace: EpisodeTrace) -> None:
-    """Keep the uncertainty of one episode, complete or not at all; an episode without any, or a crashed one, has none.
+    """Keep the predictions of one episode, complete or not at all; an episode without any, or a crashed one, has none.
 
     Args:
         folder: made if missing.
         result: how the episode ended.
         trace: what happened in it.
     """
-    known = [(step, values) for step, values in enumerate(trace.log_variance) if values is not None]
-    if not known or result.crash is not None:
+    chunks = {step: chunk for step, chunk in enumerate(trace.chunks) if chunk is not None}
+    if not chunks or result.crash is not None:
         return
+    uncertainty = [() if trace.log_variance[step] is None else trace.log_variance[step] for step in chunks]
     arrays = {
         "seed": np.int64(result.seed),
         "success": np.bool_(result.success),
         "steps": np.int64(result.steps),
-        "query": np.array([step for step, _ in known]),
-        "log_variance": np.stack([values for _, values in known]),
+        "query": np.array(list(chunks)),
+        "chunks": np.stack(list(chunks.values())).astype(np.float16),
+        "log_variance": np.array(uncertainty, np.float32),
         "contacts": np.stack([frame.contacts for frame in trace.frames]),
     }
 
@@ -66,7 +70,7 @@ def write_trace(folder: Path, result: EpisodeResult, trace: EpisodeTrace) -> Non
     publish(trace_path(folder, result), write)
 
 
-def read_traces(paths: Iterable[Path]) -> list[UncertaintyTrace]:
+def read_traces(paths: Iterable[Path]) -> list[PredictionTrace]:
     """Read traces, in the order of their seeds.
 
     Raises:
@@ -76,9 +80,10 @@ def read_traces(paths: Iterable[Path]) -> list[UncertaintyTrace]:
     for path in paths:
         try:
             with np.load(path, allow_pickle=False) as found:
-                values = {name: found[name] for name in UncertaintyTrace._fields}
+                values = {name: found[name] for name in PredictionTrace._fields}
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise DataError(path, "a trace from `ugr rollout --traces`", error, "Remove the file.") from error
+            fix = "Remove the file, and run the episode again."
+            raise DataError(path, "a trace from `ugr rollout --traces`", error, fix) from error
         scalars = {name: values[name].item() for name in ("seed", "success", "steps")}
-        traces.append(UncertaintyTrace(**{**values, **scalars}))
+        traces.append(PredictionTrace(**{**values, **scalars}))
     return sorted(traces, key=lambda trace: trace.seed)
