@@ -34,7 +34,8 @@ def overview(report):
 
 def test_the_overview_has_a_row_for_every_policy_and_execution():
     head, _, *rows = overview(table2())
-    assert head == ["policy", "setting and execution", "click_alarmclock"]
+    assert head == ["policy", "execution", "click_alarmclock"]
+    assert rows[0][1] == "aggregated chunks"
     assert [row[0] for row in rows] == ["`base`", "`uncert`", "`<b>\\|`"]
     base = table2().rates[0].total
     assert rows[0][2] == f"{base.successes}/60 [{100 * base.low:.1f}, {100 * base.high:.1f}]"

@@ -125,11 +125,13 @@ def _described(mode: Mode) -> str:
 def _overview_table(rates: Sequence[Rate]) -> list[Sequence[str]]:
     """A row per mode and policy, a column per task, and their sum where each task has as many episodes."""
     tasks = list(dict.fromkeys(rate.task for rate in rates))
+    one_setting, several = len({rate.mode.setting for rate in rates}) == 1, len(tasks) > 1
     totals: dict[tuple[str, str], dict[str, Summary]] = {}
     for rate in rates:
-        totals.setdefault((_described(rate.mode), rate.policy), {})[rate.task] = rate.total
-    several = len(tasks) > 1
-    rows: list[Sequence[str]] = [("policy", "setting and execution", *tasks, *([ALL_TASKS] if several else []))]
+        mode = described_execution(rate.mode.execution) if one_setting else _described(rate.mode)
+        totals.setdefault((mode, rate.policy), {})[rate.task] = rate.total
+    head = ("policy", "execution" if one_setting else "setting and execution")
+    rows: list[Sequence[str]] = [(*head, *tasks, *([ALL_TASKS] if several else []))]
     for (mode, policy), by_task in totals.items():
         cells = [_counted(by_task[task].successes, by_task[task].n) if task in by_task else "" for task in tasks]
         if several:
