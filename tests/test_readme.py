@@ -11,6 +11,7 @@ import torch
 
 from ugr_lightning.cli import call, main
 from ugr_lightning.models.refine.selector import Selector
+from ugr_lightning.sim.simulator import Simulator
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -155,6 +156,18 @@ def test_a_published_report_is_what_its_episodes_give(folder, capsys):
     assert capsys.readouterr().out == report
     overview = report.split("## Overview\n\n")[1].split("\n\n")[0]
     assert overview in (ROOT / "README.md").read_text(), f"README.md shows other rates than {folder}"
+
+
+def test_the_task_of_the_readme_is_found_and_its_expert_solves_it(tmp_path, monkeypatch):
+    (source,) = [b.text for b in read(ROOT / "README.md").blocks if "(TwoArmEnv)" in b.text]
+    (tmp_path / "lift_cube.py").write_text(source)
+    monkeypatch.setenv("UGR_TASKS", str(tmp_path))
+    with Simulator("lift_cube", render=False) as simulator:
+        for seed in range(6):
+            assert not simulator.reset(seed).success
+            solved = [simulator.step(step.action).success for step in simulator.expert()]
+            assert solved[-1], seed
+            assert len(solved) < simulator.horizon
 
 
 def test_the_selector_of_the_readme_selects():

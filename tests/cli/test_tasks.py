@@ -26,6 +26,7 @@ def calls(monkeypatch):
     monkeypatch.setattr(f"{where}.survey.write_survey", note("write", "the table"))
     monkeypatch.setattr(f"{where}.verify.verify_determinism", note("determinism", Verification("motion", 50, ())))
     monkeypatch.setattr(f"{where}.verify.verify_evaluation_seeds", note("seeds", Verification("list", 101, (100007,))))
+    monkeypatch.setattr(f"{where}.verify.find_evaluation_seeds", note("find", Path("list.json")))
     monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", note("probe", None))
     return asked
 
@@ -54,6 +55,12 @@ def test_verifying_prints_every_comparison_and_a_difference_is_exit_code_2(calls
     out = capsys.readouterr().out
     assert "motion: 50 of 50 agree" in out
     assert "list: 100 of 101 agree, not 100007" in out
+
+
+def test_evaluation_seeds_are_found_for_the_task_that_is_asked_for(calls, capsys):
+    assert main(["tasks", "--task", "handover_block", "--find_seeds", "--workers", "1"]) == 0
+    assert calls == [("find", ("handover_block",), {"workers": 1})]
+    assert capsys.readouterr().out == "list.json\n"
 
 
 def test_the_gallery_shows_what_is_asked_for(calls, capsys):

@@ -9,7 +9,7 @@ from ugr_lightning.errors import DataError, SimulationError
 from ugr_lightning.rollout import verify
 from ugr_lightning.rollout.results import wilson_interval
 from ugr_lightning.rollout.survey import Performer, perform, read_surveys, survey, write_survey
-from ugr_lightning.rollout.verify import verify_determinism, verify_evaluation_seeds
+from ugr_lightning.rollout.verify import find_evaluation_seeds, verify_determinism, verify_evaluation_seeds
 from ugr_lightning.rollout.workers import open_simulator
 from ugr_lightning.sim import seeds
 
@@ -107,6 +107,36 @@ def test_the_shipped_seeds_are_exactly_those_that_the_expert_solves(monkeypatch)
     assert result.differing == (100003,)
     monkeypatch.setattr(verify, "evaluation_seeds", lambda task: [100000, 100002, 100004])
     assert verify_evaluation_seeds("reach", **QUICK).differing == (100001,)
+
+
+@pytest.fixture
+def its_seeds(monkeypatch, tmp_path):
+    """The list of the task `reach`, whose expert gives up on every fifth seed."""
+    monkeypatch.setattr(verify, "perform", perform_here)
+    for module in (verify, seeds):
+        monkeypatch.setattr(module, "seeds_file", lambda task: tmp_path / "reach.json")
+        monkeypatch.setattr(module, "task_version", lambda task: 4)
+    return tmp_path / "reach.json"
+
+
+def test_the_first_seeds_that_the_expert_solves_are_written_and_read_back(its_seeds):
+    assert find_evaluation_seeds("reach", count=9, **QUICK) == its_seeds
+    solved = [100000, 100001, 100002, 100004, 100005, 100006, 100007, 100009, 100010]
+    assert json.loads(its_seeds.read_text()) == {
+        "task": "reach",
+        "version": 4,
+        "skipped": [100003, 100008],
+        "seeds": solved,
+    }
+    assert seeds.evaluation_seeds("reach") == solved
+    assert [path.name for path in its_seeds.parent.iterdir()] == [its_seeds.name]
+
+
+def test_an_expert_that_fails_leaves_the_list_as_it_was(its_seeds):
+    its_seeds.write_text("before")
+    with pytest.raises(SimulationError, match=r"got 0 of 9, not 100000, 100001, .*Repair the task's expert"):
+        find_evaluation_seeds("unsolvable", count=9, **QUICK)
+    assert its_seeds.read_text() == "before"
 
 
 def test_a_seed_list_of_another_version_is_refused_before_anything_runs(monkeypatch):

@@ -18,6 +18,7 @@ def _tasks(
     setting: str = "all",
     measure: str | None = None,
     verify: bool = False,
+    find_seeds: bool = False,
     gallery: str | None = None,
     episodes: int | None = None,
     dummy_episodes: int = 50,
@@ -26,13 +27,17 @@ def _tasks(
 ) -> int:
     """List the simulated tasks, measure them, verify that they are deterministic, or picture them.
 
+    Tasks of your own are found in the folders that the environment variable UGR_TASKS names.
+
     Args:
-        task: a name, or `all`: all of ours; outside ones are listed after them.
+        task: a name, or `all`: all but outside ones, which are listed after them.
         setting: `demo_clean`, `demo_randomized`, or `all`.
         measure: `NAME` measures success, length and cost on seeds from 400000 and writes NAME.md and NAME.json; rows
             that are there from before stay, unless they are measured again.
         verify: run the same seeds twice, in opposite order and other processes, and recompute the evaluation seeds;
             exit code 2 where something differs.
+        find_seeds: write the list of evaluation seeds, 100 from 100000 upward that the expert solves; a new task, or
+            a new version of one, needs it before policies can be tested on it.
         gallery: folder for pictures, GIFs and the page that shows them, gallery.md.
         episodes: seeds of the expert; null means 200 to measure and 50 to verify.
         dummy_episodes: seeds of `zero` and `random` when measuring; they run to the horizon.
@@ -56,6 +61,11 @@ def _tasks(
         from ugr_lightning.sim.render import require_rendering
 
         require_rendering()
+    if find_seeds:
+        from ugr_lightning.rollout.verify import find_evaluation_seeds
+
+        for name in tasks:
+            print(find_evaluation_seeds(name, workers=workers))
     if gallery is not None:
         from ugr_lightning.rollout.gallery import make_gallery
 
@@ -64,7 +74,7 @@ def _tasks(
         _measure(Path(measure), tasks, settings, episodes or 200, dummy_episodes, recordings, workers)
     if verify:
         return _verify(tasks, settings, episodes or 50, workers)
-    if gallery is None and measure is None:
+    if gallery is None and measure is None and not find_seeds:
         for name in (*tasks, *(outside_names() if task == "all" else ())):
             print(f"{name:<20}{task_summaries()[name]}")
     return 0

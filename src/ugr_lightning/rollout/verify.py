@@ -1,10 +1,15 @@
-"""What makes a benchmark one: the same seed is the same episode, and the shipped seeds are the right ones."""
+"""What makes a benchmark one: the same seed is the same episode, and the listed seeds are the right ones."""
 
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from ugr_lightning.data.folder import publish_text
+from ugr_lightning.errors import SimulationError
 from ugr_lightning.rollout.survey import FIRST_SEED, Performance, perform
-from ugr_lightning.sim.seeds import EVALUATION_START, evaluation_seeds, seeds_hash
+from ugr_lightning.sim.seeds import COUNT, EVALUATION_START, evaluation_seeds, seeds_hash
+from ugr_lightning.sim.tasks import seeds_file, task_version
 
 
 class Verification(NamedTuple):
@@ -77,3 +82,42 @@ def verify_evaluation_seeds(
     differing = tuple(item.seed for item in found if item.success != (item.seed in set(shipped)))
     what = f"{task}: {len(shipped)} evaluation seeds (hash {seeds_hash(shipped)[:12]}) and what the expert solves"
     return Verification(what, len(seeds), differing)
+
+
+def find_evaluation_seeds(
+    task: str,
+    *,
+    count: int = COUNT,
+    workers: int = 2,
+    progress: bool = True,
+    simulator: Callable[..., Any] | None = None,
+) -> Path:
+    """Write the list of a task's evaluation seeds: the first from 100000 upward that the expert solves without noise.
+
+    Args:
+        task: a name from `ugr tasks`.
+        count: how many.
+        workers: simulator processes.
+        progress: whether to show progress lines.
+        simulator: what to open in place of the task's own.
+
+    Returns:
+        The file, see `sim.tasks.seeds_file`.
+
+    Raises:
+        SimulationError: the expert fails on more seeds than it solves; the file stays as it was.
+    """
+    path, version = seeds_file(task), task_version(task)
+    solved: list[int] = []
+    skipped: list[int] = []
+    while len(solved) < count:
+        start = EVALUATION_START + len(solved) + len(skipped)
+        seeds = range(start, start + count - len(solved))
+        for item in perform(task, seeds, workers=workers, progress=progress, simulator=simulator):
+            (solved if item.success else skipped).append(item.seed)
+        if len(skipped) > len(solved):
+            got = f"{len(solved)} of {len(solved) + len(skipped)}, not {', '.join(map(str, skipped[:5]))}, ..."
+            raise SimulationError(f"expert of {task}", "most seeds solved", got, "Repair the task's expert.")
+    skipped = [seed for seed in skipped if seed < solved[-1]]
+    publish_text(path, json.dumps({"task": task, "version": version, "skipped": skipped, "seeds": solved}) + "\n")
+    return path

@@ -103,9 +103,9 @@ class TwoArmEnv(BaseEnv):
     def expert(self, arms: Arms) -> Iterator[ExpertStep]:
         """The scripted solution; reads object poses as it goes."""
 
-    @abstractmethod
     def describe(self) -> dict[str, Any]:
-        """Where things are, as plain containers."""
+        """Where things are, as plain containers; recordings and results keep it."""
+        return {}
 
     # ---------------------------------------------------------------------------------------------- what a task uses
 

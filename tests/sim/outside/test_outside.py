@@ -52,7 +52,7 @@ def test_all_means_our_own_tasks_and_every_other_name_is_ours():
 
 
 def test_an_outside_task_is_none_of_our_environments():
-    with pytest.raises(ConfigError, match="one of our own"):
+    with pytest.raises(ConfigError, match="one on our table"):
         tasks.load_task(CUBE)
 
 

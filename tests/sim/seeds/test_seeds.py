@@ -5,7 +5,7 @@ import pytest
 
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim import seeds
-from ugr_lightning.sim.tasks import load_task, task_names, task_version
+from ugr_lightning.sim.tasks import load_task, seeds_file, task_names
 
 
 @pytest.mark.parametrize("task", task_names())
@@ -19,7 +19,7 @@ def test_every_task_ships_a_hundred_seeds_apart_from_demonstrations_and_selectio
 
 @pytest.mark.parametrize("task", task_names())
 def test_the_seeds_belong_to_the_version_of_the_task_that_is_here(task):
-    content = json.loads(seeds._path(task).read_text())
+    content = json.loads(seeds_file(task).read_text())
     assert content["version"] == load_task(task).version
     assert content["task"] == task
 
@@ -39,8 +39,8 @@ def test_the_hash_is_that_of_the_comma_joined_list():
 def test_unknown_tasks_and_missing_lists_are_clear_errors(monkeypatch, tmp_path):
     with pytest.raises(ConfigError, match="handover_block"):
         seeds.evaluation_seeds("handover")
-    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "none.json")
-    with pytest.raises(SimulationError, match=r"python -m ugr_lightning\.sim\.seeds"):
+    monkeypatch.setattr(seeds, "seeds_file", lambda task: tmp_path / "none.json")
+    with pytest.raises(SimulationError, match=r"ugr tasks --task click_alarmclock --find_seeds"):
         seeds.evaluation_seeds("click_alarmclock")
 
 
@@ -55,19 +55,9 @@ def test_unknown_tasks_and_missing_lists_are_clear_errors(monkeypatch, tmp_path)
     ],
 )
 def test_a_list_of_another_version_or_with_other_seeds_is_refused(change, complaint, monkeypatch, tmp_path):
-    content = json.loads(seeds._path("click_alarmclock").read_text())
+    content = json.loads(seeds_file("click_alarmclock").read_text())
     (tmp_path / "list.json").write_text(json.dumps(content | change))
-    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "list.json")
+    monkeypatch.setattr(seeds, "seeds_file", lambda task: tmp_path / "list.json")
     with pytest.raises(SimulationError, match=complaint) as raised:
         seeds.evaluation_seeds("click_alarmclock")
     assert "--task click_alarmclock" in str(raised.value)
-
-
-def test_a_list_is_computed_from_what_the_expert_solves(monkeypatch, tmp_path):
-    monkeypatch.setattr(seeds, "_path", lambda task: tmp_path / "list.json")
-    monkeypatch.setattr(seeds, "COUNT", 2)
-    found = {"task": "click_alarmclock", "version": task_version("click_alarmclock"), "seeds": [100000]}
-    monkeypatch.setattr(seeds, "compute_evaluation_seeds", lambda task: found)
-    assert seeds.write_evaluation_seeds("click_alarmclock") == tmp_path / "list.json"
-    assert seeds.evaluation_seeds("click_alarmclock") == [100000]
-    assert [path.name for path in tmp_path.iterdir()] == ["list.json"]

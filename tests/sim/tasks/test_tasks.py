@@ -35,7 +35,7 @@ def test_every_task_has_a_summary_a_horizon_and_a_version():
 def test_an_unknown_task_names_the_closest_ones():
     with pytest.raises(ConfigError, match="Did you mean click_alarmclock"):
         load_task("click_alarm_clock")
-    with pytest.raises(ConfigError, match="ugr tasks"):
+    with pytest.raises(ConfigError, match="UGR_TASKS"):
         load_task("qqqq")
 
 

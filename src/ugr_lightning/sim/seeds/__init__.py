@@ -1,17 +1,14 @@
-"""Which seeds are for what, and the evaluation seeds that ship with the package.
+"""Which seeds are for what, and the lists of evaluation seeds.
 
 Demonstrations, evaluation and selection (rollouts during training, choices of a recipe) never share a seed.
 """
 
 import hashlib
 import json
-import os
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 from ugr_lightning.errors import SimulationError
-from ugr_lightning.sim.tasks import task_version
+from ugr_lightning.sim.tasks import seeds_file, task_version
 
 DEMONSTRATION_START = 0
 EVALUATION_START = 100_000
@@ -26,8 +23,8 @@ def evaluation_seeds(task: str) -> list[int]:
         ConfigError: there is no such task.
         SimulationError: the list is missing, damaged, or of another task or version of the task.
     """
-    version, path = task_version(task), _path(task)
-    fix = f"Recompute it: `python -m ugr_lightning.sim.seeds --task {task}`."
+    version, path = task_version(task), seeds_file(task)
+    fix = f"Make it: `ugr tasks --task {task} --find_seeds`."
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
         owner, seeds = (content["task"], content["version"]), [int(seed) for seed in content["seeds"]]
@@ -45,43 +42,3 @@ def evaluation_seeds(task: str) -> list[int]:
 def seeds_hash(seeds: Sequence[int]) -> str:
     """SHA-256 (hex) of the comma-joined list, to prove that two runs were evaluated on the same seeds."""
     return hashlib.sha256(",".join(str(int(seed)) for seed in seeds).encode()).hexdigest()
-
-
-def compute_evaluation_seeds(task: str, count: int = COUNT) -> dict[str, Any]:
-    """Run the expert without noise from seed 100000 upward until it has solved `count` of them.
-
-    Returns:
-        `{"task", "version", "skipped", "seeds"}`, what the task's file contains.
-
-    Raises:
-        SimulationError: the expert fails on more than half of the seeds.
-    """
-    from ugr_lightning.sim.outside import simulator_of
-
-    solved: list[int] = []
-    skipped: list[int] = []
-    with simulator_of(task)(task, render=False) as simulator:
-        seed = EVALUATION_START
-        while len(solved) < count:
-            success = simulator.reset(seed).success
-            for step in simulator.expert():
-                success = simulator.step(step.action).success
-            (solved if success else skipped).append(seed)
-            seed += 1
-            if len(skipped) > max(10, len(solved)):
-                raise SimulationError(f"expert of {task}", "most seeds solved", skipped, "Repair the task's expert.")
-        version = simulator.task_version
-    return {"task": task, "version": version, "skipped": skipped, "seeds": solved}
-
-
-def write_evaluation_seeds(task: str) -> Path:
-    """Recompute a task's list and put it in place of the old one; returns its path."""
-    path = _path(task)
-    aside = path.with_suffix(".json.partial")
-    aside.write_text(json.dumps(compute_evaluation_seeds(task)) + "\n", encoding="utf-8")
-    os.replace(aside, path)
-    return path
-
-
-def _path(task: str) -> Path:
-    return Path(__file__).parent / f"{task}.json"

@@ -1,35 +1,36 @@
-"""The tasks: one file each, found by listing this folder. Nothing here imports SAPIEN until a task is loaded.
+"""The tasks: one file each, found by listing folders. Nothing here imports SAPIEN until a task is loaded.
 
-Environments made by others are in `sim.outside`; their names, summaries and versions are found here as well.
+Those of users are in folders of theirs, see `sim.task_files`. Environments made by others are in `sim.outside`; their
+names, summaries and versions are found here as well.
 """
 
 import ast
 import difflib
-import importlib
 from pathlib import Path
 from typing import Any
 
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim.outside import outside_names
+from ugr_lightning.sim.task_files import OURS, VARIABLE, load_class, parse, task_files
+
+PARTS = ("horizon", "version", "build", "condition", "expert")
+"""What a task's class has to have."""
+INSTALL = "Install the simulator: `pip install sapien mani-skill`. Training works without it."
 
 
 def task_names() -> tuple[str, ...]:
-    """Names of our own tasks, sorted."""
-    return tuple(sorted(path.stem for path in Path(__file__).parent.glob("*.py") if not path.stem.startswith("_")))
+    """Names of our tasks and those of users on the same table, sorted."""
+    return tuple(task_files(outside=False))
 
 
 def all_task_names() -> tuple[str, ...]:
-    """Names of our own tasks, then those of outside ones."""
+    """The same, then the names of outside ones."""
     return (*task_names(), *outside_names())
 
 
 def task_summaries() -> dict[str, str]:
-    """One line on each task, ours and outside ones, the first of its file."""
-    summaries = {}
-    for name in all_task_names():
-        text = ast.get_docstring(ast.parse(_path(name).read_text(encoding="utf-8"))) or ""
-        summaries[name] = text.split("\n", 1)[0]
-    return summaries
+    """One line on each task, outside ones included, the first of its file."""
+    return {name: (ast.get_docstring(parse(_path(name))) or "").split("\n", 1)[0] for name in all_task_names()}
 
 
 def task_version(name: str) -> int:
@@ -41,7 +42,7 @@ def task_version(name: str) -> int:
     """
     check_task(name)
     path = _path(name)
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in ast.walk(parse(path)):
         if isinstance(node, ast.Assign) and [ast.unparse(target) for target in node.targets] == ["version"]:
             return int(ast.literal_eval(node.value))
     raise SimulationError(path, "a line `version = 1` in the class", "none", "State the task's version.")
@@ -56,12 +57,12 @@ def check_task(name: str) -> None:
     names = all_task_names()
     if name not in names:
         close = difflib.get_close_matches(name, names, n=3, cutoff=0.4)
-        fix = f"Did you mean {' or '.join(close)}?" if close else "`ugr tasks` lists them."
+        fix = f"Did you mean {' or '.join(close)}?" if close else f"Your own are found in the folders of {VARIABLE}."
         raise ConfigError("task", "one of " + ", ".join(names), repr(name), fix)
 
 
 def named_tasks(which: str) -> tuple[str, ...]:
-    """The tasks that `all`, which means our own, or a name stands for.
+    """The tasks that `all`, which leaves outside ones out, or a name stands for.
 
     Raises:
         ConfigError: neither.
@@ -72,10 +73,20 @@ def named_tasks(which: str) -> tuple[str, ...]:
     return (which,)
 
 
+def seeds_file(name: str) -> Path:
+    """Where a task's evaluation seeds are: of our tasks in `sim.seeds`, of a user's beside its file.
+
+    Raises:
+        ConfigError: there is no such task.
+    """
+    check_task(name)
+    path = _path(name)
+    return OURS / "seeds" / f"{name}.json" if path.is_relative_to(OURS) else path.with_suffix(".json")
+
+
 def _path(name: str) -> Path:
     """The file of a task."""
-    folder = Path(__file__).parent
-    return (folder.parent / "outside" if name in outside_names() else folder) / f"{name}.py"
+    return {**task_files(outside=False), **task_files(outside=True)}[name]
 
 
 def environment_id(name: str) -> str:
@@ -91,24 +102,21 @@ def load_task(name: str) -> type[Any]:
 
     Raises:
         ConfigError: there is no such task, or it is an outside one.
-        SimulationError: SAPIEN or ManiSkill is not installed, or the file defines no task.
+        SimulationError: SAPIEN or ManiSkill is not installed, or the file cannot be imported or defines no task.
     """
     check_task(name)
     if name in outside_names():
-        raise ConfigError("task", "one of our own", name, "`sim.outside.simulator_of` opens it.")
+        raise ConfigError("task", "one on our table", name, "`sim.outside.simulator_of` opens it.")
     try:
         from mani_skill.utils.registration import REGISTERED_ENVS, register_env
 
         from ugr_lightning.sim.scene import TwoArmEnv
-
-        module = importlib.import_module(f"{__name__}.{name}")
     except ModuleNotFoundError as error:
-        fix = "Install the simulator: `pip install sapien mani-skill`. Training works without it."
-        raise SimulationError(f"task {name}", "an installed simulator", f"no module {error.name}", fix) from error
-    classes = [item for item in vars(module).values() if isinstance(item, type) and item.__module__ == module.__name__]
-    tasks = [item for item in classes if issubclass(item, TwoArmEnv)]
-    if len(tasks) != 1:
-        raise SimulationError(module.__name__, "one subclass of TwoArmEnv", len(tasks), "Define exactly one per file.")
+        raise SimulationError(f"task {name}", "an installed simulator", f"no module {error.name}", INSTALL) from error
+    task = load_class(_path(name), TwoArmEnv)
+    if missing := [part for part in PARTS if getattr(task, part, None) is getattr(TwoArmEnv, part, None)]:
+        fix = "`ugr_lightning/sim/scene.py` says what each is."
+        raise SimulationError(_path(name), f"a class with {', '.join(PARTS)}", f"no {', '.join(missing)}", fix)
     if environment_id(name) not in REGISTERED_ENVS:
-        register_env(environment_id(name), max_episode_steps=tasks[0].horizon)(tasks[0])
-    return tasks[0]
+        register_env(environment_id(name), max_episode_steps=task.horizon)(task)
+    return task
