@@ -41,6 +41,17 @@ def test_the_overview_has_a_row_for_every_policy_and_execution():
     assert rows[0][2] == f"{base.successes}/60 [{100 * base.low:.1f}, {100 * base.high:.1f}]"
 
 
+def test_the_overview_keeps_the_order_of_the_policies_in_every_execution():
+    parts = [drawn("a", 0.5, task="mug"), drawn("b", 0.5, task="mug", execution="25")]
+    parts += [drawn("a", 0.5, task="handover_block", execution="25")]  # in that execution `b` has come first
+    rows = overview(build_report(parts))[2:]
+    assert [(row[0], row[1]) for row in rows] == [
+        ("`a`", "aggregated chunks"),
+        ("`a`", "25 steps of each chunk"),
+        ("`b`", "25 steps of each chunk"),
+    ]
+
+
 def test_the_overview_adds_up_tasks_only_where_all_have_as_many_episodes():
     even = [drawn("a", 0.5, n=20, seed=task == "handover_block", task=task) for task in ("mug", "handover_block")]
     head, _, row = overview(build_report(even))

@@ -96,8 +96,9 @@ class Contest:
 
 @dataclass(frozen=True)
 class Report:
-    """Rates and contests, policies in the order in which they were given, and remarks on the results themselves."""
+    """Policies in the order in which they were given, their rates and contests, and remarks on the results."""
 
+    policies: list[str]
     rates: list[Rate]
     contests: list[Contest]
     remarks: list[str]
@@ -148,7 +149,7 @@ def build_report(evaluations: Sequence[Evaluation], *, baseline: str | None = No
     left = sum(contest.left_out for contest in contests if contest.task != ALL_TASKS)
     if left:
         remarks.append(f"{left} episodes have no counterpart in a comparison and are left out of it, not of the rates.")
-    return Report(rates, contests, remarks)
+    return Report(policies, rates, contests, remarks)
 
 
 def _numbered(evaluations: Sequence[Evaluation], remarks: list[str]) -> list[Evaluation]:

@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +105,7 @@ def sections(report: Report, figures: bool = False) -> list[Section]:
     """The report's parts in order: conclusion, overview, rates by mode, comparisons by mode, method."""
     found = [Section("Conclusion", conclude(report).parts, report.remarks)]
     if report.rates:
-        found.append(Section("Overview", table=_overview_table(report.rates)))
+        found.append(Section("Overview", table=_overview_table(report)))
     for mode in dict.fromkeys(rate.mode for rate in report.rates):
         rates = [rate for rate in report.rates if rate.mode == mode]
         contests = [contest for contest in report.contests if contest.mode == mode]
@@ -122,17 +123,21 @@ def _described(mode: Mode) -> str:
     return f"{mode.setting}, {described_execution(mode.execution)}"
 
 
-def _overview_table(rates: Sequence[Rate]) -> list[Sequence[str]]:
+def _overview_table(report: Report) -> list[Sequence[str]]:
     """A row per mode and policy, a column per task, and their sum where each task has as many episodes."""
+    rates = report.rates
     tasks = list(dict.fromkeys(rate.task for rate in rates))
     one_setting, several = len({rate.mode.setting for rate in rates}) == 1, len(tasks) > 1
-    totals: dict[tuple[str, str], dict[str, Summary]] = {}
+    totals: dict[str, dict[str, dict[str, Summary]]] = {}  # by mode, by policy, by task
     for rate in rates:
         mode = described_execution(rate.mode.execution) if one_setting else _described(rate.mode)
-        totals.setdefault((mode, rate.policy), {})[rate.task] = rate.total
+        totals.setdefault(mode, {}).setdefault(rate.policy, {})[rate.task] = rate.total
     head = ("policy", "execution" if one_setting else "setting and execution")
     rows: list[Sequence[str]] = [(*head, *tasks, *([ALL_TASKS] if several else []))]
-    for (mode, policy), by_task in totals.items():
+    for mode, policy in product(totals, report.policies):
+        by_task = totals[mode].get(policy)
+        if by_task is None:
+            continue
         cells = [_counted(by_task[task].successes, by_task[task].n) if task in by_task else "" for task in tasks]
         if several:
             sizes = [total.n for total in by_task.values()]
