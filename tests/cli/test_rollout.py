@@ -2,6 +2,7 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 from PIL import Image
 
 from ugr_lightning.cli.main import main
@@ -69,6 +70,20 @@ def test_results_say_which_budget_was_chosen_and_a_test_that_goes_on_keeps_budge
     written = read_results(tmp_path / "evaluation.jsonl")
     assert [item.refine_ratio for item in written] == [None, None, 0.0, 0.0, 0.5, 0.5]
     assert len({item.policy for item in written}) == 3
+
+
+def test_the_policy_computes_where_it_is_asked_to(world, tiny_act, untrained, tmp_path, monkeypatch, capsys):
+    checkpoint = untrained(tiny_act(), tmp_path)
+    moved, real = [], torch.nn.Module.to
+    monkeypatch.setattr(torch.nn.Module, "to", lambda self, place: moved.append(place) or real(self, place))
+    for choice in ("auto", "cpu"):
+        command = ["--episodes", "1", "--executions", "[aggregate]", "--device", choice]
+        assert main(["test", "--ckpt_path", str(checkpoint), *command]) == 0
+        assert main(["rollout", "--policy", str(checkpoint), "--episodes", "1", "--device", choice]) == 0
+    here = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    assert moved == [here, here, torch.device("cpu"), torch.device("cpu")]
+    assert main(["test", "--ckpt_path", str(checkpoint), "--device", "abacus"]) == 2
+    assert "device: expected a device of this machine, got abacus" in " ".join(capsys.readouterr().err.split())
 
 
 def test_seed_lists_are_what_they_say():

@@ -5,11 +5,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from PIL import Image
 
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
+from ugr_lightning.models.device import chosen_device
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.rollout.actors import PolicyActor
@@ -73,7 +73,7 @@ class Deployment:
         self.state_dim, self.action_dim, self.chunk_length = policy.state_dim, policy.action_dim, policy.chunk_length
         if refine_ratio is not None:
             policy = with_refine_ratio(policy, refine_ratio)
-        policy = policy.to(_device(device)).for_inference()
+        policy = policy.to(chosen_device(device)).for_inference()
         self._actor = PolicyActor(policy, cameras=policy.cameras, refine_ratio=refine_ratio)
         self._actor.begin(slots, policy.chunk_length if execution == WHOLE_CHUNKS else execution)
         self._begins = set(range(slots))
@@ -185,16 +185,6 @@ def _size(size: Any, checkpoint: Path | str) -> tuple[int, int]:
         raise CheckpointError(checkpoint, "the size of the pictures", "none", fix)
     height, width = size
     return int(height), int(width)
-
-
-def _device(name: str) -> torch.device:
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    try:
-        return torch.empty(0, device=name).device
-    except (RuntimeError, AssertionError) as error:
-        fix = "Use `auto`, `cpu` or `cuda:0`."
-        raise ConfigError("device", "a device of this machine", name, fix) from error
 
 
 def _finite(action: np.ndarray | None, slot: int) -> np.ndarray:

@@ -30,6 +30,7 @@ def _rollout(
     out: str | None = None,
     traces: str | None = None,
     refine_ratio: float | None = None,
+    device: str = "auto",
 ) -> int:
     """Let a policy act in a task and count its successes.
 
@@ -47,6 +48,7 @@ def _rollout(
         out: results file, one JSON line per episode is appended.
         traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
+        device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
     """
     from ugr_lightning.rollout.results import success_table
 
@@ -67,6 +69,7 @@ def _rollout(
         out=None if out is None else Path(out),
         traces=None if traces is None else Path(traces),
         refine_ratio=refine_ratio,
+        device=device,
     )
     print(success_table(results))
     return 0
@@ -86,6 +89,7 @@ def roll_out(
     out: Path | None = None,
     traces: Path | None = None,
     refine_ratio: float | None = None,
+    device: str = "auto",
     resume: bool = False,
     keep: "Runners | None" = None,
 ) -> list[EpisodeResult]:
@@ -101,6 +105,7 @@ def roll_out(
     """
     import tempfile
 
+    from ugr_lightning.models.device import chosen_device
     from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.rollout.actors import DUMMIES, Actor, PolicyActor, make_actor
     from ugr_lightning.rollout.lockstep import EpisodeTrace
@@ -130,7 +135,7 @@ def roll_out(
             model, name = with_refine_ratio(model, refine_ratio), f"{name}(refine_ratio={refine_ratio:g})"
         task = task or trained.get("task")  # type: ignore[assignment]
         state, seen = trained.get("state", "commanded"), task_cameras(str(task))
-        fast = model.for_inference()
+        fast = model.to(chosen_device(device)).for_inference()
         actor = PolicyActor(fast, name=name, state=state, cameras=seen, refine_ratio=refine_ratio)  # type: ignore[arg-type]
     if task is None:
         raise ConfigError("--task", "a task", "none", "`ugr tasks` lists them.")
@@ -223,6 +228,7 @@ def _test(
     out: str | None = None,
     traces: str | None = None,
     refine_ratio: float | None = None,
+    device: str = "auto",
     resume: bool = False,
 ) -> int:
     """Success of a checkpoint on the task's evaluation seeds, with aggregated chunks and with executed ones.
@@ -239,6 +245,7 @@ def _test(
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
         traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
+        device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
         resume: run only the episodes that the results file lacks.
     """
     from ugr_lightning.rollout.results import success_table
@@ -261,6 +268,7 @@ def _test(
                 out=file,
                 traces=None if traces is None else Path(traces),
                 refine_ratio=refine_ratio,
+                device=device,
                 resume=resume,
                 keep=simulators,
             )

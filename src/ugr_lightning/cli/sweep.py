@@ -29,6 +29,7 @@ def _sweep(
     data: str | None = "data/160x120",
     stride: int = 5,
     workers: int = 2,
+    device: str = "auto",
     out: str | None = None,
 ) -> int:
     """Success of one checkpoint by refinement budget and by execution, on the same seeds; goes on where it was stopped.
@@ -47,6 +48,7 @@ def _sweep(
             for the offline error; null leaves it out.
         stride: control steps between two queries of the offline error.
         workers: simulator processes.
+        device: where the policy computes in closed loop: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
         out: folder for episodes, tables and figure; null means `sweep-<checkpoint>` beside the checkpoint.
     """
     from ugr_lightning.cli.lock import locked
@@ -60,7 +62,7 @@ def _sweep(
     errors = _offline(plan, data, stride) if plan.ratios and data is not None else None
     folder = Path(out) if out else checkpoint.with_name(f"sweep-{checkpoint.stem}")
     with locked(folder / "sweep.lock", str(folder)):
-        budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers)
+        budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers, device)
         _report(plan, budgets, modes, errors, folder)
     return 0
 
@@ -139,7 +141,7 @@ Episodes = dict[str, Sequence[EpisodeResult]]
 
 
 def _closed_loop(
-    plan: Plan, file: Path, seeds: Literal["selection", "evaluation"] | int, episodes: int, workers: int
+    plan: Plan, file: Path, seeds: Literal["selection", "evaluation"] | int, episodes: int, workers: int, device: str
 ) -> tuple[Episodes, Episodes]:
     """Episodes by name of the budget and by name of the execution; only those that the file lacks are run."""
     from ugr_lightning.analysis.closed_loop import budget_name, execution_name
@@ -157,6 +159,7 @@ def _closed_loop(
                 workers=workers,
                 out=file,
                 refine_ratio=None if ratio == plan.trained else ratio,
+                device=device,
                 resume=True,
                 keep=simulators,
             )

@@ -93,7 +93,7 @@ class NoiseProcess:
 
         generators = [torch.Generator().manual_seed(seed) for _ in range(shape[0])]  # one per row
         x = randn_tensor(shape, generator=generators, device=device, dtype=torch.float32)  # (B, L, A)
-        for step in self.scheduler.timesteps:
-            prediction = denoise(x, step.to(device).expand(shape[0]))  # (B, L, A)
-            x = self.scheduler.step(prediction, int(step), x, generator=generators, return_dict=False)[0]
+        for step in self.scheduler.timesteps.tolist():
+            prediction = denoise(x, torch.full(shape[:1], step, device=device))  # (B, L, A)
+            x = self.scheduler.step(prediction, step, x, generator=generators, return_dict=False)[0]
         return x

@@ -42,7 +42,7 @@ class Prior(Ranked):
 
     def scores(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
         """The static errors, (K,)."""
-        return torch.tensor(self.errors, device=valid.device)
+        return torch.tensor(self.errors).to(valid.device)
 
 
 def _read(path: Path) -> list[float]:
