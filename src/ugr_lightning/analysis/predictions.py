@@ -1,11 +1,12 @@
 """What a trained policy predicts on the demonstrations it was, and was not, trained on."""
 
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
-from ugr_lightning.contract import ChunkPolicy
+from ugr_lightning.contract import Batch, Chunk, ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import DataError
@@ -53,13 +54,9 @@ def predict(
     Returns:
         Predictions in the order of episode and step.
     """
-    frames = data.data.frames.of(episodes, stride)
     std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
     parts: list[dict[str, Any]] = []
-    for start in range(0, len(frames), batch_size):
-        batch = data.data.__getitems__(frames[start : start + batch_size].tolist())
-        with torch.no_grad():
-            chunk = policy.predict(batch.observation)
+    for batch, chunk in queries(policy, data, episodes, stride=stride, batch_size=batch_size):
 
         def error(actions: torch.Tensor, batch: Any = batch) -> np.ndarray:
             length = ((actions.float() - batch.actions) / std).norm(dim=-1)  # (B, K)
@@ -78,6 +75,25 @@ def predict(
     columns: dict[str, list[Any]] = {name: [part[name] for part in parts] for name in Predictions._fields}
     whole: dict[str, Any] = {name: None if of[0] is None else np.concatenate(of) for name, of in columns.items()}
     return Predictions(**whole)
+
+
+def queries(
+    policy: ChunkPolicy, data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, batch_size: int = 16
+) -> Iterator[tuple[Batch, Chunk]]:
+    """What was seen and done at every `stride`-th step of some episodes, and what a policy would do; in order.
+
+    Args:
+        policy: in evaluation mode.
+        data: after `setup`.
+        episodes: positions of the episodes.
+        stride: control steps between two queries.
+        batch_size: queries at once.
+    """
+    frames = data.data.frames.of(episodes, stride)
+    for start in range(0, len(frames), batch_size):
+        batch = data.data.__getitems__(frames[start : start + batch_size].tolist())
+        with torch.no_grad():
+            yield batch, policy.predict(batch.observation)
 
 
 def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end: str | None = None) -> ChunkDataModule:

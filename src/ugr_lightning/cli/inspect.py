@@ -51,14 +51,14 @@ def _checkpoint(path: Path) -> list[str]:
     split = info.data.get("split") or {}
     lines = [
         f"{path}: checkpoint of {about['blueprint']['class_path']}, {count / 1e6:.2f} M parameters",
-        f"sha256      {info.sha256}",
-        f"trained     {info.step} steps, {info.epoch + 1} epochs",
-        f"chunk       {about['chunk_length']} x {about['action_dim']} actions from {about['state_dim']} states",
-        f"cameras     {', '.join(about['cameras'])}",
-        *(f"{name:<12}{value}" for name, value in info.data.items() if name != "split"),
-        *(f"split       {part}: {_short(members)}" for part, members in split.items()),
-        f"versions    {', '.join(f'{name} {number}' for name, number in about['versions'].items())}",
-        f"arguments   {json.dumps(about['blueprint']['init_args'])}",
+        f"sha256        {info.sha256}",
+        f"trained       {info.step} steps, {info.epoch + 1} epochs",
+        f"chunk         {about['chunk_length']} x {about['action_dim']} actions from {about['state_dim']} states",
+        f"cameras       {', '.join(about['cameras'])}",
+        *(f"{name:<13} {value}" for name, value in info.data.items() if name != "split"),
+        *(f"split         {part}: {_short(members)}" for part, members in split.items()),
+        f"versions      {', '.join(f'{name} {number}' for name, number in about['versions'].items())}",
+        f"arguments     {json.dumps(about['blueprint']['init_args'])}",
         "statistics and other buffers:",
     ]
     return lines + [

@@ -16,6 +16,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
     "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
     "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
+    "predict": ("ugr_lightning.cli.predict:run", "a checkpoint's commands beside those of demonstrations, by joint"),
     "analyze": ("ugr_lightning.cli.analyze:run", "whether a checkpoint's uncertainty knows the error"),
     "sweep": ("ugr_lightning.cli.sweep:run", "one checkpoint with many budgets and executions, in closed loop"),
     "benchmark": (

@@ -1,0 +1,75 @@
+"""`ugr predict`: what a checkpoint would have commanded along demonstrations."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from ugr_lightning.cli.call import call
+from ugr_lightning.errors import ConfigError
+
+
+def run(command: str, argv: Sequence[str]) -> int:
+    """Run `ugr predict`."""
+    if argv and not argv[0].startswith("-"):  # `ugr predict CKPT`
+        argv = ["--ckpt_path", *argv]
+    return call(_predict, command, argv)
+
+
+def _predict(
+    ckpt_path: str = "best",
+    run: str | None = None,
+    root: str = "runs",
+    data: str = "data/160x120",
+    episodes: int = 10,
+    stride: int = 5,
+    pictures: int = 2,
+    out: str | None = None,
+) -> int:
+    """Say how far a policy's commands are from those of demonstrations, where it was trained and where it was not.
+
+    Needs no simulator and no robot, and works for every policy and every format of demonstrations.
+
+    Args:
+        ckpt_path: `best`, `best_loss`, `last`, or a checkpoint file.
+        run: name or folder of a run; null takes the newest run.
+        root: folder of all runs.
+        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
+        episodes: how many training and how many validation episodes, at most; the first of its own split.
+        stride: control steps between two queries.
+        pictures: how many episodes of both are pictured.
+        out: folder for the page, its numbers and pictures; null means `predictions-<checkpoint>` beside the checkpoint.
+    """
+    from ugr_lightning.analysis import open_loop as kit
+    from ugr_lightning.analysis.calibration_report import as_text
+    from ugr_lightning.analysis.predictions import STD_FLOOR, open_data
+    from ugr_lightning.analysis.study import write_page
+    from ugr_lightning.cli.rollout import newest_run
+    from ugr_lightning.cli.runs import resolve_checkpoint
+    from ugr_lightning.training.checkpoint import load_policy
+
+    for name, value, least in (("--episodes", episodes, 1), ("--stride", stride, 1), ("--pictures", pictures, 0)):
+        if value < least:
+            raise ConfigError(name, f"at least {least}", value, "Correct the number.")
+    checkpoint = resolve_checkpoint(ckpt_path, run or newest_run(Path(root)), Path(root))
+    policy, info = load_policy(checkpoint)
+    opened = open_data(policy, info.data, data)
+    fast, split = policy.for_inference(), opened.episode_split
+    parts = {"training": split.train[:episodes], "validation": split.validation[:episodes]}
+    followed = {name: kit.follow(fast, opened, chosen, stride=stride) for name, chosen in parts.items()}
+    std = opened.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
+    errors = kit.compare_parts(followed["training"], followed["validation"], std)
+    says = kit.conclusion(errors, (len(parts["training"]), len(parts["validation"])))
+    table = kit.error_table(errors)
+    figures = {
+        f"{name}-{opened.demonstrations[episode].name}": kit.episode_figure(
+            followed[name], opened, episode, f"{opened.demonstrations[episode].name}, {name}"
+        )
+        for name, chosen in parts.items()
+        for episode in chosen[:pictures]
+    }
+    print(f"checkpoint: {checkpoint}\n{as_text(table)}\n\n{says}")
+    folder = Path(out) if out else checkpoint.with_name(f"predictions-{checkpoint.stem}")
+    about = {"file": str(checkpoint), "sha256": info.sha256, "task": opened.task}
+    content = {"checkpoint": about, "stride": stride, "conclusion": says, "errors": errors}
+    write_page(folder, "predictions", f"Predictions of {checkpoint}", [says], [table], figures, content)
+    print(f"numbers and pictures: {folder}")
+    return 0

@@ -1,0 +1,70 @@
+"""`ugr predict` from a checkpoint to its table and pictures."""
+
+import json
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from tiny import TinyPolicy
+
+from ugr_lightning.cli.main import main
+from ugr_lightning.contract import CAMERAS, Observation
+from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.models.diffusion import DiffusionPolicy
+from ugr_lightning.training.checkpoint import load_policy
+
+
+@pytest.fixture
+def command(ten_demonstrations, tmp_path, untrained):
+    """The command line for a checkpoint of a policy that was told the statistics and learned nothing."""
+    untrained(TinyPolicy(cameras=CAMERAS, dim=14), tmp_path)
+    return ["predict", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations)]
+
+
+def test_it_writes_errors_by_command_and_pictures_of_both_parts(command, capsys, tmp_path):
+    assert main([*command, "--pictures", "1"]) == 0
+    said = capsys.readouterr().out
+    folder = tmp_path / "predictions-policy_best"
+    found = json.loads((folder / "predictions.json").read_text())
+    assert found["conclusion"] in said
+    assert "On 8 training episodes" in said
+    assert "does not fit the demonstrations" in said, "it learned nothing"
+    assert found["conclusion"] in (folder / "predictions.md").read_text()
+    pictures = sorted(folder.glob("*.png"))
+    assert [picture.name.partition("-")[0] for picture in pictures] == ["training", "validation"]
+    assert all(np.asarray(Image.open(picture)).std() > 0 for picture in pictures)
+
+
+def test_the_errors_are_those_of_the_queries(command, ten_demonstrations, tmp_path):
+    assert main([*command, "--stride", "4", "--pictures", "0", "--out", str(tmp_path / "out")]) == 0
+    found = json.loads((tmp_path / "out" / "predictions.json").read_text())["errors"]
+    policy, _ = load_policy(tmp_path / "policy_best.ckpt")
+    steps = policy.chunk_length
+    data = ChunkDataModule(root=str(ten_demonstrations), episodes=10, chunk_length=steps, after_end="hold")
+    data.setup()
+    off = []
+    for number in data.episode_split.validation:
+        episode = data.demonstrations[number]
+        for step in range(0, episode.length, 4):
+            images = torch.from_numpy(episode.images(step)).movedim(-1, -3)[None]  # (1, V, 3, H, W)
+            plan = policy.predict(Observation(images, torch.from_numpy(episode.state[step])[None])).actions[0].numpy()
+            done = episode.action[np.minimum(step + np.arange(steps), episode.length - 1)]  # (K, A), held at the end
+            off.append(np.abs(plan - done))
+    assert found["validation"] == pytest.approx(np.concatenate(off).mean(0), rel=1e-4)
+    assert not list((tmp_path / "out").glob("*.png"))
+
+
+def test_a_policy_that_sees_a_history_is_followed_too(ten_demonstrations, tmp_path, untrained, capsys):
+    policy = DiffusionPolicy(
+        cameras=CAMERAS, diffusion_steps=2, sampling_steps=2, unet_widths=(16, 32), backbone_width=8, precision="fp32"
+    )
+    untrained(policy, tmp_path)
+    command = ["predict", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations), "--episodes", "1"]
+    assert main([*command, "--stride", "6"]) == 0
+    assert "On 1 training episodes" in capsys.readouterr().out
+
+
+def test_numbers_that_make_no_sense_are_refused(command, capsys):
+    assert main([*command, "--episodes", "0"]) == 2
+    assert "--episodes: expected at least 1, got 0" in " ".join(capsys.readouterr().err.split())
