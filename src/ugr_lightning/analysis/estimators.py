@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from ugr_lightning.analysis import calibration as kit
-from ugr_lightning.analysis.predictions import STD_FLOOR, Predictions
+from ugr_lightning.analysis.predictions import STD_FLOOR, Predictions, batches
 from ugr_lightning.contract import Chunk, Observation
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.models.act import ACT
@@ -37,12 +37,10 @@ def sampled_deviation(
     Returns:
         (n, K) root of the variance, summed over the action, of the coarse actions.
     """
-    frames = data.data.frames.of(episodes, stride)
     std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
     found = []
-    for start in range(0, len(frames), batch_size):
-        observation = data.data.__getitems__(frames[start : start + batch_size].tolist()).observation
-        chunks = [draw(observation) for _ in range(samples)]
+    for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
+        chunks = [draw(batch.observation) for _ in range(samples)]
         actions = torch.stack([chunk.actions if chunk.coarse is None else chunk.coarse for chunk in chunks])
         found.append((actions.float() / std).var(0).sum(-1).sqrt())  # (B, K)
     return torch.cat(found).double().numpy()

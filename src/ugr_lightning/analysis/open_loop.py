@@ -7,9 +7,10 @@ joints or times that do not belong together; one that is right there and wrong e
 from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from ugr_lightning.analysis.calibration_report import Cells
-from ugr_lightning.analysis.predictions import queries
+from ugr_lightning.analysis.predictions import batches
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
 
@@ -79,7 +80,9 @@ def follow(policy: ChunkPolicy, data: ChunkDataModule, episodes: tuple[int, ...]
         stride: control steps between two queries.
     """
     parts: list[list[np.ndarray]] = []
-    for batch, chunk in queries(policy, data, episodes, stride=stride):
+    for batch in batches(data, episodes, stride=stride):
+        with torch.no_grad():
+            chunk = policy.predict(batch.observation)
         state = batch.state if batch.state.dim() == 2 else batch.state[:, -1]  # (B, S), now
         found = (chunk.actions.float(), batch.actions, batch.valid, state, batch.episode, batch.step)
         parts.append([tensor.numpy() for tensor in found])

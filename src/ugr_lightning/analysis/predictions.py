@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from ugr_lightning.contract import Batch, Chunk, ChunkPolicy
+from ugr_lightning.contract import Batch, ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import DataError
@@ -56,7 +56,9 @@ def predict(
     """
     std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
     parts: list[dict[str, Any]] = []
-    for batch, chunk in queries(policy, data, episodes, stride=stride, batch_size=batch_size):
+    for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
+        with torch.no_grad():
+            chunk = policy.predict(batch.observation)
 
         def error(actions: torch.Tensor, batch: Any = batch) -> np.ndarray:
             length = ((actions.float() - batch.actions) / std).norm(dim=-1)  # (B, K)
@@ -77,23 +79,18 @@ def predict(
     return Predictions(**whole)
 
 
-def queries(
-    policy: ChunkPolicy, data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, batch_size: int = 16
-) -> Iterator[tuple[Batch, Chunk]]:
-    """What was seen and done at every `stride`-th step of some episodes, and what a policy would do; in order.
+def batches(data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, batch_size: int = 16) -> Iterator[Batch]:
+    """What was seen and done at every `stride`-th step of some episodes, in order.
 
     Args:
-        policy: in evaluation mode.
         data: after `setup`.
         episodes: positions of the episodes.
-        stride: control steps between two queries.
-        batch_size: queries at once.
+        stride: control steps between two samples.
+        batch_size: samples at once.
     """
     frames = data.data.frames.of(episodes, stride)
     for start in range(0, len(frames), batch_size):
-        batch = data.data.__getitems__(frames[start : start + batch_size].tolist())
-        with torch.no_grad():
-            yield batch, policy.predict(batch.observation)
+        yield data.data.__getitems__(frames[start : start + batch_size].tolist())
 
 
 def open_data(policy: ChunkPolicy, trained: dict[str, Any], root: str, after_end: str | None = None) -> ChunkDataModule:
