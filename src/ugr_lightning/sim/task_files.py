@@ -8,6 +8,7 @@ import ast
 import importlib
 import os
 import sys
+import traceback
 from collections.abc import Iterator
 from importlib.machinery import SourceFileLoader
 from pathlib import Path
@@ -63,8 +64,10 @@ def load_class(path: Path, base: type) -> type[Any]:
     try:
         module = _module(path)
     except Exception as error:  # whatever a user's file raises
-        got, fix = f"{type(error).__name__}: {error}", "Correct the file; UGR_DEBUG=1 shows where."
-        raise SimulationError(path, "a task that can be imported", got, fix) from error
+        lines = [frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)]
+        where = f" in line {lines[-1]}" if lines else ""
+        got = f"{type(error).__name__}{where}: {error}"
+        raise SimulationError(path, "a task that can be imported", got, "Correct the file.") from error
     classes = [item for item in vars(module).values() if isinstance(item, type) and item.__module__ == module.__name__]
     found = [item for item in classes if issubclass(item, base)]
     if len(found) != 1:
