@@ -25,7 +25,8 @@ METHOD = (
     "generalisation in which every evaluation seed counts once (signs of the summed differences are flipped). p-values "
     "are corrected by Holm's method within each execution mode, single tasks and all tasks apart. Intervals of "
     "differences are Newcombe's for one task and one training seed, otherwise from a hierarchical bootstrap over "
-    "training seeds and evaluation seeds, or, where no episode differs, Wilson's for the share of seeds that could."
+    "training seeds and evaluation seeds, or, where no episode differs, Wilson's for the share of seeds that could; "
+    "they are not corrected, so that one may leave out zero where the corrected p shows no difference."
 )
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;max-width:64rem;margin:2rem auto;padding:0 1rem;color:#222}"
