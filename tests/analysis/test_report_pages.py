@@ -32,13 +32,20 @@ def overview(report):
     return [[cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]] for line in section.splitlines()]
 
 
-def test_the_overview_has_a_row_for_every_policy_and_execution():
+def test_the_overview_of_one_task_has_a_row_for_every_policy():
     head, _, *rows = overview(table2())
-    assert head == ["policy", "execution", "click_alarmclock"]
-    assert rows[0][1] == "aggregated chunks"
+    assert head == ["policy", "click_alarmclock, aggregated chunks"]
     assert [row[0] for row in rows] == ["`base`", "`uncert`", "`<b>\\|`"]
     base = table2().rates[0].total
-    assert rows[0][2] == f"{base.successes}/60 [{100 * base.low:.1f}, {100 * base.high:.1f}]"
+    assert rows[0][1] == f"{base.successes}/60 [{100 * base.low:.1f}, {100 * base.high:.1f}]"
+
+
+def test_the_overview_of_one_task_has_a_column_for_every_execution():
+    parts = [drawn("a", 0.5, n=20, task="mug"), drawn("b", 1.0, n=20, task="mug", execution="25")]
+    head, _, *rows = overview(build_report(parts))
+    assert head == ["policy", "mug, aggregated chunks", "mug, 25 steps of each chunk"]
+    assert rows[0][2] == rows[1][1] == ""
+    assert rows[1] == ["`b`", "", "20/20 [83.9, 100.0]"]
 
 
 def test_the_overview_keeps_the_order_of_the_policies_in_every_execution():

@@ -4,7 +4,7 @@ import csv
 import html
 import io
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
@@ -125,27 +125,39 @@ def _described(mode: Mode) -> str:
 
 
 def _overview_table(report: Report) -> list[Sequence[str]]:
-    """A row per mode and policy, a column per task, and their sum where each task has as many episodes."""
-    rates = report.rates
-    tasks = list(dict.fromkeys(rate.task for rate in rates))
-    one_setting, several = len({rate.mode.setting for rate in rates}) == 1, len(tasks) > 1
+    """A row per policy and a column per mode; of several tasks, a row per mode too and a column per task."""
+    one_setting = len({rate.mode.setting for rate in report.rates}) == 1
     totals: dict[str, dict[str, dict[str, Summary]]] = {}  # by mode, by policy, by task
-    for rate in rates:
+    for rate in report.rates:
         mode = described_execution(rate.mode.execution) if one_setting else _described(rate.mode)
         totals.setdefault(mode, {}).setdefault(rate.policy, {})[rate.task] = rate.total
-    head = ("policy", "execution" if one_setting else "setting and execution")
-    rows: list[Sequence[str]] = [(*head, *tasks, *([ALL_TASKS] if several else []))]
-    for mode, policy in product(totals, report.policies):
+    tasks = list(dict.fromkeys(rate.task for rate in report.rates))
+    if len(tasks) > 1:
+        head = ("policy", "execution" if one_setting else "setting and execution", *tasks, ALL_TASKS)
+        return [head, *_overview_of_tasks(totals, report.policies, tasks)]
+    rows: list[Sequence[str]] = [("policy", *(f"{tasks[0]}, {mode}" for mode in totals))]
+    for policy in report.policies:
+        found = [by_policy.get(policy, {}).get(tasks[0]) for by_policy in totals.values()]
+        if any(found):
+            rows.append(
+                (f"`{policy}`", *("" if total is None else _counted(total.successes, total.n) for total in found))
+            )
+    return rows
+
+
+def _overview_of_tasks(
+    totals: dict[str, dict[str, dict[str, Summary]]], policies: Sequence[str], tasks: Sequence[str]
+) -> Iterator[Sequence[str]]:
+    """A row per mode and policy: each task, and their sum where each has as many episodes."""
+    for mode, policy in product(totals, policies):
         by_task = totals[mode].get(policy)
         if by_task is None:
             continue
+        sizes = [total.n for total in by_task.values()]
+        whole = len(by_task) == len(tasks) and len(set(sizes)) == 1
         cells = [_counted(by_task[task].successes, by_task[task].n) if task in by_task else "" for task in tasks]
-        if several:
-            sizes = [total.n for total in by_task.values()]
-            whole = len(by_task) == len(tasks) and len(set(sizes)) == 1
-            cells.append(_counted(sum(t.successes for t in by_task.values()), sum(sizes)) if whole else "")
-        rows.append((f"`{policy}`", mode, *cells))
-    return rows
+        cells.append(_counted(sum(t.successes for t in by_task.values()), sum(sizes)) if whole else "")
+        yield (f"`{policy}`", mode, *cells)
 
 
 def _counted(successes: int, n: int) -> str:
