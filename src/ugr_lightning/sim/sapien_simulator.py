@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ugr_lightning.embodiment import ACTION_DIM, CAMERAS
-from ugr_lightning.sim.episode_runner import EpisodeRunner
+from ugr_lightning.embodiment import CAMERAS
 from ugr_lightning.sim.expert import Arms, ExpertStep
-from ugr_lightning.sim.frame import Frame, camera_projections, checked_command
+from ugr_lightning.sim.frame import Frame
 from ugr_lightning.sim.kinematics import SIDES, UnreachableError
 from ugr_lightning.sim.render import render_device
+from ugr_lightning.sim.simulator import Simulator
 from ugr_lightning.sim.tasks import load_task
 
 
@@ -24,8 +24,8 @@ def _keep_imports_from_collection() -> None:
     gc.freeze()
 
 
-class SapienSimulator(EpisodeRunner):
-    """Runs episodes of a task; a context manager.
+class SapienSimulator(Simulator):
+    """Runs episodes of a task on our table, bit for bit the same for the same seed.
 
     Set `OMP_NUM_THREADS=1` in processes that simulate: SAPIEN uses one core, and torch's threads only get in its way.
 
@@ -42,78 +42,8 @@ class SapienSimulator(EpisodeRunner):
     """
 
     cameras = CAMERAS
-    action_dim = ACTION_DIM
-
-    def __init__(
-        self,
-        task: str,
-        *,
-        setting: str = "demo_clean",
-        image_size: tuple[int, int] = (120, 160),
-        render: bool = True,
-        speed: float = 1.0,
-    ) -> None:
-        super().__init__(task, setting, image_size, render, speed)
-        environment = load_task(task)
-        self.horizon: int = environment.horizon
-        self.task_version: int = environment.version
-        os.environ.setdefault("MS_RENDERER_LOG_LEVEL", "error")
-        _keep_imports_from_collection()
-        self._env = environment(
-            setting=setting,
-            image_size=self.image_size,
-            obs_mode="none",
-            render_backend=render_device() if render else "none",
-        )
-        self.control_hz = float(self._env.control_freq)
-
-    def reset(self, seed: int, *, look: bool = True) -> Frame:
-        """Start the episode of a seed; the same one bit for bit, whatever ran before.
-
-        Args:
-            seed: of the episode.
-            look: whether the frame has images.
-        """
-        self._env.reset(seed=int(seed))
-        self._seed = int(seed)
-        surroundings = self._env.surroundings.describe()
-        self._scene_info = {"seed": self._seed, **self._env.describe(), "surroundings": surroundings}
-        return self._frame(look)
-
-    def step(self, action: np.ndarray, *, look: bool = True) -> Frame:
-        """Command joint targets for one control step.
-
-        Args:
-            action: (14,) radians and gripper openings; clipped to the limits.
-            look: whether the frame has images; taking them is nine tenths of the time of a step.
-
-        Raises:
-            NumericsError: the action has a NaN or an infinity; the simulator has not seen it.
-            SimulationError: `reset` has not been called.
-        """
-        self._require_episode()
-        self._env._step_action(checked_command(action, ACTION_DIM))
-        return self._frame(look)
-
-    def expert(self) -> Iterator[ExpertStep]:
-        """The scripted expert of the current episode.
-
-        It reads the simulator's state as it goes, so each of its steps has to be executed (with or without noise)
-        before the next is asked for. It ends early where an object has got out of reach; the episode is then lost.
-        """
-        self._require_episode()
-        try:
-            yield from self._env.expert(Arms(self._env.command, self.speed, self._env.surroundings.table_drop))
-        except UnreachableError:
-            return
-
-    def scene_info(self) -> dict[str, Any]:
-        """Seed, where things were at reset and what surrounded them, as plain containers."""
-        self._require_episode()
-        return self._scene_info
 
     def camera_parameters(self) -> dict[str, dict[str, np.ndarray]]:
-        """Per camera `intrinsic_cv` (3, 3), `extrinsic_cv` (3, 4) and `cam2world_gl` (4, 4) at this moment."""
         self._require_episode()
         sensors = self._env._sensors if self._render else {}
         return {
@@ -123,28 +53,53 @@ class SapienSimulator(EpisodeRunner):
         }
 
     def close(self) -> None:
-        """Free the scene."""
         self._env.close()
         self._seed = None
 
-    def _frame(self, look: bool) -> Frame:
+    def _open(self) -> None:
+        environment = load_task(self.task)
+        self.horizon, self.task_version = environment.horizon, environment.version
+        os.environ.setdefault("MS_RENDERER_LOG_LEVEL", "error")
+        _keep_imports_from_collection()
+        self._env = environment(
+            setting=self.setting,
+            image_size=self.image_size,
+            obs_mode="none",
+            render_backend=render_device() if self._render else "none",
+        )
+        self.control_hz = float(self._env.control_freq)
+
+    def _start(self, seed: int) -> None:
+        self._env.reset(seed=seed)
+        self._scene = {**self._env.describe(), "surroundings": self._env.surroundings.describe()}
+
+    def _advance(self, action: np.ndarray) -> bool:
+        self._env._step_action(action)
+        return bool(self._env.succeeded)
+
+    def _demonstrate(self) -> Iterator[ExpertStep]:
+        try:
+            yield from self._env.expert(Arms(self._env.command, self.speed, self._env.surroundings.table_drop))
+        except UnreachableError:
+            return
+
+    def _describe(self) -> dict[str, Any]:
+        return self._scene
+
+    def _frame(self, images: np.ndarray, success: bool) -> Frame:
         poses = [self._env.tool_pose(side) for side in SIDES]
         touching = {touch.side for touch in self._env.touches()}
         return Frame(
-            images=self._pictures(look),
+            images=images,
             commanded=self._env.command.copy(),
             measured=self._env.agent.measured(),
             endpose=np.array([[*pose.p, *pose.q] for pose in poses], np.float64),
             contacts=np.array([side in touching for side in SIDES]),
-            success=self._env.succeeded,
-            projection=camera_projections(self.camera_parameters(), self.image_size) if self._render and look else None,
+            success=success,
         )
 
-    def _pictures(self, look: bool) -> np.ndarray:
-        height, width = self.image_size
-        if not (self._render and look):
-            return np.zeros((0, height, width, 3), np.uint8)
-        images = np.empty((len(CAMERAS), height, width, 3), np.uint8)
+    def _pictures(self) -> np.ndarray:
+        images = np.empty((len(CAMERAS), *self.image_size, 3), np.uint8)
         self._env.scene.sub_scenes[0].update_render()
         cameras = [self._env._sensors[name].camera._render_cameras[0] for name in CAMERAS]
         for camera in cameras:

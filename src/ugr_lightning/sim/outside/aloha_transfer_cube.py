@@ -66,7 +66,6 @@ class AlohaTransferCube(OutsideSimulator):
         return {"top": {"intrinsic_cv": intrinsic, "extrinsic_cv": extrinsic, "cam2world_gl": world}}
 
     def close(self) -> None:
-        """Free the physics and the renderer."""
         self._physics.free()
         self._env.close()
 
