@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import sapien
@@ -67,11 +68,7 @@ class Prop:
             solid: whether it collides.
         """
         pose, half = pose_of(at, rotation), [edge / 2.0 for edge in size]
-        if solid:
-            self._builder.add_box_collision(pose, half, material=self._material, density=self._density)
-        if colour is not None:
-            self._builder.add_box_visual(pose, half, material=self._paint(colour))
-        return self
+        return self._add("box", pose, (half,), colour, solid)
 
     def cylinder(
         self,
@@ -84,14 +81,7 @@ class Prop:
         solid: bool = True,
     ) -> "Prop":
         """Add a cylinder along the axis `x`, `y` or `z`; the other arguments as for `box`."""
-        pose = pose_of(at, _X_TO[axis])
-        if solid:
-            self._builder.add_cylinder_collision(
-                pose, radius, length / 2.0, material=self._material, density=self._density
-            )
-        if colour is not None:
-            self._builder.add_cylinder_visual(pose, radius, length / 2.0, material=self._paint(colour))
-        return self
+        return self._add("cylinder", pose_of(at, _X_TO[axis]), (radius, length / 2.0), colour, solid)
 
     def capsule(
         self,
@@ -109,13 +99,7 @@ class Prop:
         line = np.subtract(end, start)
         length = float(np.linalg.norm(line))
         pose = pose_of(np.add(start, end) / 2.0, _frame_along(line / length))
-        if solid:
-            self._builder.add_capsule_collision(
-                pose, radius, length / 2.0, material=self._material, density=self._density
-            )
-        if colour is not None:
-            self._builder.add_capsule_visual(pose, radius, length / 2.0, material=self._paint(colour))
-        return self
+        return self._add("capsule", pose, (radius, length / 2.0), colour, solid)
 
     def lathe(
         self, profile: Sequence[tuple[float, float]], colour: Colour, at: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -140,6 +124,15 @@ class Prop:
         """Put the prop into the scene."""
         self._builder.initial_pose = pose
         return self._builder.build_static(name=name) if static else self._builder.build(name=name)
+
+    def _add(self, kind: str, pose: sapien.Pose, sizes: tuple[Any, ...], colour: Colour | None, solid: bool) -> "Prop":
+        """Add a shape that SAPIEN knows by name, in half sizes."""
+        if solid:
+            collide = getattr(self._builder, f"add_{kind}_collision")
+            collide(pose, *sizes, material=self._material, density=self._density)
+        if colour is not None:
+            getattr(self._builder, f"add_{kind}_visual")(pose, *sizes, material=self._paint(colour))
+        return self
 
     def _paint(self, colour: Colour) -> "sapien.render.RenderMaterial | None":
         return sapien.render.RenderMaterial(base_color=[*colour, 1.0]) if self._renders else None
