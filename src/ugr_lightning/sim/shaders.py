@@ -7,13 +7,14 @@ What the table is multiplied with is black, so the pictures are the same bit for
 import functools
 import hashlib
 import importlib.util
+import os
 import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from ugr_lightning.sim.generated import cached_folder
+from ugr_lightning.system.files import publish_folder
 
 # file -> what is edited, each pattern to be found once, and what takes its place
 _EDITS = {
@@ -55,7 +56,15 @@ def plain_shaders(installed: Path | None = None) -> Path | None:
             (folder / "plain" / name).write_text(text, encoding="utf-8")
 
     digest = hashlib.sha256("".join(texts.values()).encode()).hexdigest()
-    return cached_folder(f"shaders-{digest[:16]}", write) / "plain"
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = cache / "ugr-lightning" / f"shaders-{digest[:16]}"
+    try:
+        if not folder.is_dir():
+            publish_folder(folder, write)
+    except OSError:
+        if not folder.is_dir():  # otherwise another process was first, with the same content
+            raise
+    return folder / "plain"
 
 
 def camera_shader() -> Any:
