@@ -79,7 +79,7 @@ def test_workers_and_interruptions_do_not_change_the_data_set(reference, tmp_pat
 
 def test_a_complete_folder_is_left_alone(reference, monkeypatch):
     before = content(reference)
-    monkeypatch.setattr("ugr_lightning.demos.collect.Worker", lambda *_: pytest.fail("opened a simulator"))
+    monkeypatch.setattr("ugr_lightning.demos.collect.spread", lambda *_, **__: pytest.fail("opened a simulator"))
     record(reference, episodes=4)
     assert content(reference) == before
 
@@ -178,7 +178,7 @@ def test_a_seed_that_kills_its_process_is_tried_again(tmp_path, capsys, monkeypa
     record(tmp_path / "data", episodes=4, task="deadly_once")
     assert read_seeds(tmp_path / "data") == SOLVED[:4]
     assert (
-        "Seed 2: recording process 1 was ended by SIGKILL, as the system does when memory runs out; trying"
+        "Seed 2: process 1 was ended by SIGKILL, as the system does when memory runs out; trying"
         in capsys.readouterr().err
     )
 

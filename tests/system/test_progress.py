@@ -38,7 +38,6 @@ def test_a_terminal_gets_a_bar():
 
     stream = Terminal()
     with Progress("recording", 2, stream=stream) as line:
-        line.begin()
         line.advance("seed 0")
         line.message("[seed 1] skipped")
         line.advance()

@@ -3,7 +3,8 @@
 import json
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
@@ -29,10 +30,7 @@ from ugr_lightning.sim.tasks import all_task_names, check_task, task_summaries, 
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.lock import locked
 from ugr_lightning.system.progress import Progress
-from ugr_lightning.system.workers import Worker, WorkerLostError, start_all, wait_for_any
-
-EPISODE_TIMEOUT_S = 600.0
-"""No expert takes that long; a simulator that does has hung."""
+from ugr_lightning.system.spread import spread
 
 HOPELESS = 50
 """So many seeds without a success mean that the expert cannot do the task in this setting."""
@@ -94,52 +92,40 @@ def collect(
             return
         open_task = partial(open_simulator, task, setting=setting, image_size=image_size)
         build = partial(Recorder, open_task, noise, folder / "staging", video)
-        pool = [Worker(build, f"recording process {index + 1}") for index in range(min(workers, episodes))]
         ledger = _Ledger(folder, task, first_seed)
         with Progress(f"{task}: demonstrations", episodes, done=ledger.count(episodes), shown=progress) as line:
-            try:
-                start_all(pool)
-                line.begin()
-                _record(ledger, episodes, pool, line)
-            finally:
-                for worker in pool:
-                    worker.kill()
+            _record(ledger, episodes, build, workers, line)
         shutil.rmtree(folder / "staging", ignore_errors=True)
 
 
-def _record(ledger: "_Ledger", episodes: int, pool: list[Worker], line: Progress) -> None:
-    """Keep every worker busy with the next seed, and file the outcomes in the order of the seeds."""
-    jobs, busy = ledger.seeds(episodes), dict[Worker, int]()
-    waiting: list[int] = []  # seeds that have killed a process once
+def _record(ledger: "_Ledger", episodes: int, build: Callable[[], Recorder], workers: int, line: Progress) -> None:
+    """Keep every process busy with the next seed, and file the outcomes in the order of the seeds."""
+    wanted = ledger.seeds(episodes)
+    given: list[int] = []
+    again: list[int] = []  # seeds that have killed a process once
     outcomes: dict[int, Outcome] = {}
-    killed: set[int] = set()
 
-    def give(worker: Worker) -> None:
-        busy[worker] = waiting.pop(0) if waiting else next(jobs)
-        worker.send("record", busy[worker])
+    def seeds() -> Iterator[int]:
+        while True:
+            given.append(again.pop(0) if again else next(wanted))
+            yield given[-1]
 
-    for worker in pool:
-        give(worker)
-    while ledger.count(episodes) < episodes:
-        ready = wait_for_any(list(busy), EPISODE_TIMEOUT_S) or list(busy)  # nobody: each has hung
-        for worker in ready:
-            seed = busy.pop(worker)
-            try:
-                outcomes[seed] = worker.receive(0.0)
-            except WorkerLostError as error:
-                line.message(f"Seed {seed}: {error}; {'skipped' if seed in killed else 'trying it once more'}.")
-                if seed in killed:
-                    outcomes[seed] = Outcome(seed, 0, str(error))
-                else:
-                    killed.add(seed)
-                    waiting.append(seed)
-                start_all([worker])
+    with closing(spread(build, "record", seeds(), workers=min(workers, episodes))) as ended:
+        for done in ended:
+            seed = given[done.job]
+            if done.fault is None:
+                outcomes[seed] = done.value
+            elif given.count(seed) > 1:
+                line.message(f"Seed {seed}: {done.fault}; skipped.")
+                outcomes[seed] = Outcome(seed, 0, done.fault)
+            else:
+                line.message(f"Seed {seed}: {done.fault}; trying it once more.")
+                again.append(seed)
             for outcome in ledger.file(outcomes, episodes):
                 if outcome.failure is None:
                     line.advance(f"seed {outcome.seed}, {outcome.steps} steps")
             if ledger.count(episodes) >= episodes:
                 return
-            give(worker)
 
 
 class _Ledger:

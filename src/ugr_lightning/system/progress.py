@@ -2,7 +2,6 @@
 
 import sys
 import time
-from types import TracebackType
 from typing import Self, TextIO
 
 from rich.console import Console
@@ -43,17 +42,9 @@ class Progress:
             self._bar.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         if self._bar is not None:
             self._bar.stop()
-
-    def begin(self) -> None:
-        """Start the clock: what went before, such as starting processes, does not enter the estimate."""
-        self._start = self._last_line = time.monotonic()
-        if self._bar is not None:
-            self._bar.reset(self._task, completed=self._done)
 
     def advance(self, note: str = "") -> None:
         """Count one more.

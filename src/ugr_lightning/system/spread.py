@@ -1,6 +1,7 @@
 """Independent jobs over worker processes; a process that dies or hangs costs one job."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable
+from itertools import islice
 from typing import Any, NamedTuple
 
 from ugr_lightning.system.workers import Worker, WorkerLostError, start_all, wait_for_any
@@ -25,38 +26,38 @@ class Done(NamedTuple):
 def spread(
     build: Callable[[], Any],
     method: str,
-    jobs: Sequence[Any],
+    jobs: Iterable[Any],
     *,
     workers: int = 1,
     timeout_s: float = JOB_TIMEOUT_S,
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Call a method once per job, on objects in processes of their own.
 
     Args:
         build: makes the object of a process; see `workers.Worker`.
         method: its method, called with one job.
-        jobs: the arguments.
+        jobs: the arguments; those behind the first `workers` are asked for when a process is free.
         workers: processes.
         timeout_s: a process that takes longer for a job counts as hung.
 
     Yields:
-        The jobs in the order in which they end.
+        The jobs in the order in which they end. Closing the generator ends the processes.
 
     Raises:
         UGRError: what building the object or the method raised.
     """
-    pool = [Worker(build, f"process {index + 1}") for index in range(min(workers, len(jobs)))]
-    waiting, busy = list(range(len(jobs))), dict[Worker, int]()
+    waiting, busy = enumerate(jobs), dict[Worker, int]()
+    first = list(islice(waiting, workers))
+    pool = [Worker(build, f"process {index + 1}") for index, _ in first]
 
-    def give(worker: Worker) -> None:
-        if waiting:
-            busy[worker] = waiting.pop(0)
-            worker.send(method, jobs[busy[worker]])
+    def give(worker: Worker, index: int, job: Any) -> None:
+        busy[worker] = index
+        worker.send(method, job)
 
     try:
         start_all(pool)
-        for worker in pool:
-            give(worker)
+        for worker, numbered in zip(pool, first, strict=True):
+            give(worker, *numbered)
         while busy:
             for worker in wait_for_any(list(busy), timeout_s) or list(busy):  # nobody: each has hung
                 index = busy.pop(worker)
@@ -65,7 +66,8 @@ def spread(
                 except WorkerLostError as error:
                     yield Done(index, None, str(error))
                     start_all([worker])
-                give(worker)
+                for numbered in islice(waiting, 1):
+                    give(worker, *numbered)
     finally:
         for worker in pool:
             worker.kill()
