@@ -37,7 +37,7 @@ def test_frozen_normalisation_has_no_parameters():
 @pytest.mark.parametrize(("stride", "last"), [(32, (2, 3)), (16, (4, 6))])
 def test_strides_are_as_announced(stem, stride, last):
     network = ResNet18(8, stride, stem, "group")
-    middle, features = network(network.prepare(images()))
+    _, _, middle, features = network(network.prepare(images()))
     assert middle.shape == (2, 32, 4, 6)
     assert features.shape == (2, 64, *last)
 
@@ -98,27 +98,24 @@ def test_weights_load_from_three_ecosystems(tmp_path, prefix):
         assert key == "pretrained" or torch.equal(value, weights[key])
 
 
-def test_missing_file_is_named(tmp_path):
-    with pytest.raises(CheckpointError, match=r"nowhere\.pth"):
-        ResNet18(8).load_weights(tmp_path / "nowhere.pth")
-
-
-def test_damaged_file_is_refused(tmp_path):
-    (tmp_path / "weights.pth").write_bytes(b"not weights")
-    with pytest.raises(CheckpointError, match="plain tensors"):
-        ResNet18(8).load_weights(tmp_path / "weights.pth")
-
-
-def test_file_that_would_run_code_is_refused(tmp_path):
-    torch.save(nn.Linear(1, 1), tmp_path / "weights.pth")
-    with pytest.raises(CheckpointError, match="plain tensors"):
-        ResNet18(8).load_weights(tmp_path / "weights.pth")
-
-
-def test_other_network_is_refused(tmp_path):
-    torch.save({"head.weight": torch.zeros(1)}, tmp_path / "weights.pth")
-    with pytest.raises(CheckpointError, match="ResNet-18"):
-        ResNet18(8).load_weights(tmp_path / "weights.pth")
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (None, r"weights\.pth"),
+        (b"not weights", "plain tensors"),
+        (nn.Linear(1, 1), "plain tensors"),
+        ({"head.weight": torch.zeros(1)}, "ResNet-18"),
+    ],
+    ids=["missing", "damaged", "would run code", "another network"],
+)
+def test_a_file_that_is_no_weights_of_a_resnet_is_refused(tmp_path, content, message):
+    path = tmp_path / "weights.pth"
+    if isinstance(content, bytes):
+        path.write_bytes(content)
+    elif content is not None:
+        torch.save(content, path)
+    with pytest.raises(CheckpointError, match=message):
+        ResNet18(8).load_weights(path)
 
 
 def test_other_width_is_refused_and_changes_nothing(tmp_path):

@@ -84,7 +84,6 @@ class PicturePolicy(ChunkPolicy):
         self.needs_projection = keyframes is not None
 
     def set_statistics(self, statistics: Statistics) -> None:
-        """Store the normalisation statistics in the policy's buffers."""
         statistics = mirrored_statistics(statistics) if self.mirror else statistics
         self.normalizer.fit(statistics)
         if self.finder is not None:
@@ -170,7 +169,7 @@ class PicturePolicy(ChunkPolicy):
         x = backbone.prepare(pixels)
         if self.training and self.color_jitter:
             x = jitter_colour(x, self.color_jitter, cameras)
-        return Looked(backbone.stages(x), shift)
+        return Looked(backbone(x), shift)
 
     def find_keyframes(self, looked: Looked, projection: Tensor | None, labels: Keyframes | None) -> Sighting | None:
         """The hands' next keyframes, where the policy looks for them.

@@ -182,12 +182,7 @@ class ResNet18(nn.Module):
         x = pixels.contiguous().permute(0, 3, 1, 2).float()  # (n, 3 or 3 fold^2, ...)
         return torch.addcmul(self.pixel_shift, x, self.pixel_scale)
 
-    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Features of prepared images by the third and the last stage; see `stages`."""
-        _, _, middle, last = self.stages(x)
-        return middle, last
-
-    def stages(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Features of prepared images.
 
         Args:
