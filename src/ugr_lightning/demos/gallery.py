@@ -1,6 +1,5 @@
 """A page of pictures: an expert's episode per task and setting, as a small GIF and as a sheet of stills."""
 
-import io
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -94,9 +93,8 @@ class Photographer:
         """Start, middle and end from top to bottom, the cameras from left to right."""
         moments = (0, len(frames) // 2, len(frames) - 1)
         rows = [np.concatenate(list(self._unpacked(frames[step][0])), axis=1) for step in moments]  # (H, V W, 3)
-        buffer = io.BytesIO()
-        Image.fromarray(np.concatenate(rows)).save(buffer, format="JPEG", quality=80)
-        publish(path, lambda partial: _write_bytes(partial, buffer.getvalue()))
+        stills = Image.fromarray(np.concatenate(rows))
+        publish(path, lambda partial: stills.save(partial, format="JPEG", quality=80))
 
     def _unpacked(self, jpegs: tuple[bytes, ...]) -> np.ndarray:
         """(V, H, W, 3) uint8."""
@@ -113,10 +111,6 @@ def _packed(frame: Frame) -> tuple[tuple[bytes, ...], bool]:
 def _small(images: np.ndarray) -> np.ndarray:
     """(V, h, w, 3) uint8 at the size of the GIF."""
     return np.stack([np.asarray(Image.fromarray(image).resize(GIF_SIZE, Image.Resampling.BOX)) for image in images])
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    path.write_bytes(content)
 
 
 def make_gallery(

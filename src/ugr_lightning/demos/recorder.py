@@ -19,29 +19,15 @@ from ugr_lightning.sim.simulator import Simulator
 from ugr_lightning.system.files import publish_text
 
 
-class RecordedEpisode(NamedTuple):
-    """An episode of N steps as it happened, in memory: N + 1 frames.
+class _Attempt(NamedTuple):
+    """An episode of N steps as it happened, in memory: N + 1 frames."""
 
-    Args:
-        frames: what the simulator showed, pictures taken out.
-        pictures: per frame the JPEG of each camera.
-        views: per frame (H, W, 3) uint8 of the first camera, empty unless asked for.
-        camera_parameters: per frame.
-        intentions: the expert's N steps.
-        scene_info: where things were at reset.
-    """
-
-    frames: list[Frame]
-    pictures: list[tuple[bytes, ...]]
-    views: list[np.ndarray]
+    frames: list[Frame]  # without their pictures
+    pictures: list[tuple[bytes, ...]]  # a JPEG of each camera
+    views: list[np.ndarray]  # of the first camera, (H, W, 3) uint8; none unless a video was asked for
     camera_parameters: list[dict[str, dict[str, np.ndarray]]]
-    intentions: list[ExpertStep]
+    intentions: list[ExpertStep]  # N of them
     scene_info: dict[str, Any]
-
-    @property
-    def success(self) -> bool:
-        """Whether the task's condition was met."""
-        return bool(self.frames[-1].success)
 
 
 class Outcome(NamedTuple):
@@ -73,41 +59,6 @@ def staged_video(staging: Path, seed: int) -> Path:
     return staging / f"seed{seed}.mp4"
 
 
-def record_episode(
-    simulator: Simulator, seed: int, noise: Noise, *, attempt: int = 0, views: bool = False
-) -> RecordedEpisode:
-    """Let the expert do the task once: the first frame after reset, then one after each step.
-
-    Args:
-        simulator: one that renders.
-        seed: which episode.
-        noise: how much the executed commands stray from the expert's.
-        attempt: how many times the seed has been tried before; decides the noise together with the seed.
-        views: whether to keep the first camera's pictures for a video.
-
-    Returns:
-        The recording, successful or not.
-
-    Source: RoboTwin-Platform/RoboTwin@13c3c47, envs/_base_task.py (when a frame is stored); docs/data.md.
-    """
-    process = ExecutionNoise(noise, seed, attempt, simulator.control_hz, simulator.action_dim)
-    recording = RecordedEpisode([], [], [], [], [], {})
-
-    def keep(frame: Frame) -> None:
-        recording.frames.append(frame._replace(images=frame.images[:0]))
-        recording.pictures.append(encode_frame(frame.images))
-        recording.camera_parameters.append(simulator.camera_parameters())
-        if views:
-            recording.views.append(frame.images[0].copy())
-
-    keep(simulator.reset(seed))
-    recording.scene_info.update(simulator.scene_info())
-    for intention in simulator.expert():
-        recording.intentions.append(intention)
-        keep(simulator.step(process.disturb(intention.action, intention.slack)))
-    return recording
-
-
 class Recorder:
     """Records seeds into a staging folder; lives in a worker process.
 
@@ -134,18 +85,40 @@ class Recorder:
         failure, steps = "", 0
         for attempt in range(self._tries):
             try:
-                recording = record_episode(self._simulator, seed, self._noise, attempt=attempt, views=self._video)
+                recording = self._try(seed, attempt)
             except SimulationError as error:
                 failure = str(error)
                 continue
             steps = len(recording.intentions)
-            if recording.success and steps:
+            if recording.frames[-1].success and steps:
                 self._write(recording, seed, attempt)
                 return Outcome(seed, steps)
             failure = f"the expert did not succeed in {steps} steps"
         return Outcome(seed, steps, failure)
 
-    def _write(self, recording: RecordedEpisode, seed: int, attempt: int) -> None:
+    def _try(self, seed: int, attempt: int) -> _Attempt:
+        """The expert does the task once: the first frame after reset, then one after each step.
+
+        Source: RoboTwin-Platform/RoboTwin@13c3c47, envs/_base_task.py (when a frame is stored); docs/data.md.
+        """
+        simulator, recording = self._simulator, _Attempt([], [], [], [], [], {})
+        process = ExecutionNoise(self._noise, seed, attempt, simulator.control_hz, simulator.action_dim)
+
+        def keep(frame: Frame) -> None:
+            recording.frames.append(frame._replace(images=frame.images[:0]))
+            recording.pictures.append(encode_frame(frame.images))
+            recording.camera_parameters.append(simulator.camera_parameters())
+            if self._video:
+                recording.views.append(frame.images[0].copy())
+
+        keep(simulator.reset(seed))
+        recording.scene_info.update(simulator.scene_info())
+        for intention in simulator.expert():
+            recording.intentions.append(intention)
+            keep(simulator.step(process.disturb(intention.action, intention.slack)))
+        return recording
+
+    def _write(self, recording: _Attempt, seed: int, attempt: int) -> None:
         frames, intentions, simulator = recording.frames, recording.intentions, self._simulator
         scene = {**recording.scene_info, "seed": seed, "attempt": attempt, "steps": len(intentions)}
         text = json.dumps(scene, indent=2)
