@@ -91,3 +91,18 @@ def write_maniskill(folder, name="trajectory", count=4, steps=12, mode="pd_joint
     entries = [{"episode_id": e, "episode_seed": e, "control_mode": mode, "elapsed_steps": steps} for e in range(count)]
     (folder / f"{name}.json").write_text(json.dumps({"env_info": {"env_id": "Cube-v1"}, "episodes": entries}))
     return folder
+
+
+def replace(key, *arguments, **options):
+    """Damage to an open file: another dataset at `key`, given as to `create_dataset`."""
+
+    def damage(file):
+        del file[key]
+        file.create_dataset(key, *arguments, **options)
+
+    return damage
+
+
+def poke(key, where, value):
+    """Damage to an open file: another value at one place of a dataset."""
+    return lambda file: file[key].__setitem__(where, value)

@@ -3,34 +3,13 @@
 import h5py
 import numpy as np
 import pytest
+from foreign_files import ACT_CAMERAS, pictures, replace, waves, write_act
 
 from ugr_lightning.data.formats import EpisodeLocation, detect, find_format
 from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.data.layout import Joint, Layout
 from ugr_lightning.data.storage.hdf5_frames import RawFrames
 from ugr_lightning.errors import ConfigError, DataError
-
-PROCESSED = ("cam_high", "cam_right_wrist", "cam_left_wrist")
-
-
-def _pictures(frames, seed, size=(24, 32)):
-    return np.random.default_rng(seed).integers(0, 256, (frames, *size, 3), np.uint8)
-
-
-def _processed(path, frames=9, cameras=PROCESSED, joints=14):
-    """As RoboTwin's converter: T raw frames give T - 1 rows, qpos of frame t beside the vector of frame t + 1."""
-    vector = np.random.default_rng(frames).normal(size=(frames, joints))
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with h5py.File(path, "w") as file:
-        file.create_dataset("action", data=np.array([row.astype(np.float32) for row in vector[1:]]))
-        observations = file.create_group("observations")
-        observations.create_dataset("qpos", data=np.array([row.astype(np.float32) for row in vector[:-1]]))
-        observations.create_dataset("left_arm_dim", data=np.array([6] * (frames - 1)))
-        observations.create_dataset("right_arm_dim", data=np.array([6] * (frames - 1)))
-        images = observations.create_group("images")
-        for view, camera in enumerate(cameras):
-            images.create_dataset(camera, data=np.stack(_pictures(frames, view)[:-1]), dtype=np.uint8)
-    return vector
 
 
 def _original(path, steps=8, cameras=("top",), simulated=True):
@@ -47,7 +26,7 @@ def _original(path, steps=8, cameras=("top",), simulated=True):
         for name, array in data.items():
             file[name][...] = array
         for view, camera in enumerate(cameras):
-            file[f"observations/images/{camera}"][...] = _pictures(steps, view)
+            file[f"observations/images/{camera}"][...] = pictures(steps, seed=view)
     return data
 
 
@@ -56,19 +35,20 @@ def _read(path, wanted, **layout):
 
 
 def test_a_processed_episode_is_read_with_its_label_beside_each_state(tmp_path):
-    vector = _processed(tmp_path / "episode_0.hdf5")
+    write_act(tmp_path, 1, steps=8)
+    vector = waves(9, 14)
     assert detect(tmp_path).name == "act"
-    episode = _read(tmp_path / "episode_0.hdf5", PROCESSED)
+    episode = _read(tmp_path / "episode_0.hdf5", ACT_CAMERAS)
     assert (episode.length, episode.image_size, episode.measured) == (8, (24, 32), None)
-    assert np.array_equal(episode.state, vector[:-1].astype(np.float32))
-    assert np.array_equal(episode.action, vector[1:].astype(np.float32))
+    assert np.array_equal(episode.state, vector[:-1])
+    assert np.array_equal(episode.action, vector[1:])
     for step in (0, 7):
-        assert np.array_equal(episode.images(step), [_pictures(9, view)[step] for view in range(3)])
-    assert np.array_equal(_read(tmp_path / "episode_0.hdf5", PROCESSED[::-1]).images(3), episode.images(3)[::-1])
+        assert np.array_equal(episode.images(step), [pictures(8, seed=view)[step] for view in range(3)])
+    assert np.array_equal(_read(tmp_path / "episode_0.hdf5", ACT_CAMERAS[::-1]).images(3), episode.images(3)[::-1])
 
 
 def test_frames_are_read_one_at_a_time(tmp_path, monkeypatch):
-    _processed(tmp_path / "episode_0.hdf5")
+    write_act(tmp_path, 1)
     read = []
     original = h5py.Dataset.__getitem__
 
@@ -78,17 +58,17 @@ def test_frames_are_read_one_at_a_time(tmp_path, monkeypatch):
         return original(dataset, key, *more)
 
     monkeypatch.setattr(h5py.Dataset, "__getitem__", watch)
-    episode = _read(tmp_path / "episode_0.hdf5", PROCESSED)
+    episode = _read(tmp_path / "episode_0.hdf5", ACT_CAMERAS)
     assert read == []
     episode.images(5)
     assert read == [5, 5, 5]
 
 
 def test_xpolicylabs_copies_of_the_format_call_the_head_camera_otherwise(tmp_path):
-    _processed(tmp_path / "episode_0.hdf5", cameras=("cam_head", "cam_right_wrist", "cam_left_wrist"))
-    episode = _read(tmp_path / "episode_0.hdf5", PROCESSED)
-    assert np.array_equal(episode.images(2)[0], _pictures(9, 0)[2])
-    assert detect(tmp_path).peek(EpisodeLocation(tmp_path / "episode_0.hdf5")).cameras == PROCESSED
+    write_act(tmp_path, 1, cameras=("cam_head", "cam_right_wrist", "cam_left_wrist"))
+    episode = _read(tmp_path / "episode_0.hdf5", ACT_CAMERAS)
+    assert np.array_equal(episode.images(2)[0], pictures(14)[2])
+    assert detect(tmp_path).peek(EpisodeLocation(tmp_path / "episode_0.hdf5")).cameras == ACT_CAMERAS
 
 
 @pytest.mark.parametrize("simulated", [True, False])
@@ -104,36 +84,28 @@ def test_an_original_episode_is_read_with_the_command_of_its_own_row_as_label(si
     assert np.array_equal(episode.state, data["observations/qpos"].astype(np.float32))
     assert np.array_equal(episode.measured, episode.state)
     assert np.array_equal(episode.extras["qvel"], data["observations/qvel"].astype(np.float32))
-    assert np.array_equal(episode.images(7)[0], _pictures(8, 0)[7])
+    assert np.array_equal(episode.images(7)[0], pictures(8)[7])
     renamed = _read(tmp_path / "episode_3.hdf5", ("cam_high",), cameras={"cam_high": "top"})
     assert np.array_equal(renamed.images(7), episode.images(7))
 
 
 @pytest.mark.parametrize("joints", [7, 16])
 def test_other_robots_are_a_matter_of_the_layout(joints, tmp_path):
-    vector = _processed(tmp_path / "episode_0.hdf5", joints=joints).astype(np.float32)
+    write_act(tmp_path, 1, steps=8, width=joints)
+    vector = waves(9, joints)
     with pytest.raises(DataError, match=rf"qpos.*\(T, 14\).*\(8, {joints}\)"):
-        _read(tmp_path / "episode_0.hdf5", PROCESSED)
+        _read(tmp_path / "episode_0.hdf5", ACT_CAMERAS)
     assert len(detect(tmp_path).peek(EpisodeLocation(tmp_path / "episode_0.hdf5")).state) == joints
-    whole = _read(tmp_path / "episode_0.hdf5", PROCESSED, state=joints)
+    whole = _read(tmp_path / "episode_0.hdf5", ACT_CAMERAS, state=joints)
     assert np.array_equal(whole.state, vector[:-1])
     picked = _read(tmp_path / "episode_0.hdf5", ("cam_high",), state=(2, Joint(joints - 1, scale=2.0)), action=(0,))
     assert np.allclose(picked.state, vector[:-1, [2, joints - 1]] * [1, 2])
     assert np.array_equal(picked.action, vector[1:, :1])
 
 
-def test_a_recording_converted_to_a_processed_file_is_the_same_to_the_bit(tmp_path, episode_file):
-    given = read_episode(episode_file)
-    form, done = find_format("act"), []
-    form.write(tmp_path / "act", [given], done.append)
-    assert done == [0]
-    assert detect(tmp_path / "act").name == "act"
-    back = _read(tmp_path / "act" / "episode_0.hdf5", given.cameras)
-    assert isinstance(back.frames, RawFrames)
-    assert np.array_equal(back.state, given.state)
-    assert np.array_equal(back.action, given.action)
-    for step in range(given.length):
-        assert np.array_equal(back.images(step), given.images(step))
+def test_a_recording_becomes_what_robotwins_converter_writes(tmp_path, episode_file):
+    find_format("act").write(tmp_path / "act", [read_episode(episode_file)])
+    assert isinstance(_read(tmp_path / "act" / "episode_0.hdf5", ACT_CAMERAS).frames, RawFrames)
     with h5py.File(tmp_path / "act" / "episode_0.hdf5") as file:
         assert sorted(file) == ["action", "observations", "ugr"]
         assert "sim" not in file.attrs
@@ -142,28 +114,16 @@ def test_a_recording_converted_to_a_processed_file_is_the_same_to_the_bit(tmp_pa
         assert file["observations/left_arm_dim"].dtype == np.int64
         for key in ("action", "observations/qpos"):
             assert (file[key].shape, file[key].dtype) == ((12, 14), np.float32)
-        for camera in PROCESSED:
+        for camera in ACT_CAMERAS:
             pictures = file[f"observations/images/{camera}"]
             assert (pictures.shape, pictures.dtype, pictures.chunks) == ((12, 24, 32, 3), np.uint8, None)
-
-
-def test_a_recording_goes_to_a_processed_file_and_back_without_loss(tmp_path, episode_file):
-    given = read_episode(episode_file)
-    find_format("act").write(tmp_path / "act", [given])
-    find_format("robotwin").write(tmp_path / "back", [_read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)])
-    assert detect(tmp_path / "back").name == "robotwin"
-    back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
-    assert (back.seed, back.length) == (given.seed, given.length)
-    assert np.array_equal(back.state, given.state)
-    assert np.array_equal(back.action, given.action)
-    assert [back.frames.encoded(step) for step in range(12)] == [given.frames.encoded(step) for step in range(12)]
 
 
 def test_jpegs_that_no_longer_match_the_frames_are_not_used(tmp_path, episode_file):
     find_format("act").write(tmp_path / "act", [read_episode(episode_file)])
     with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
         file["observations/images/cam_high"][3] = 200
-    find_format("robotwin").write(tmp_path / "back", [_read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)])
+    find_format("robotwin").write(tmp_path / "back", [_read(tmp_path / "act" / "episode_0.hdf5", ACT_CAMERAS)])
     back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
     assert np.abs(back.images(3)[0].astype(int) - 200).max() <= 2
 
@@ -174,7 +134,7 @@ def test_a_processed_file_of_others_converted_to_a_recording_keeps_joints_to_the
     find_format("act").write(tmp_path / "act", [read_episode(episode_file)])
     with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
         del file["ugr"]
-    given = _read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)
+    given = _read(tmp_path / "act" / "episode_0.hdf5", ACT_CAMERAS)
     find_format("robotwin").write(tmp_path / "back", [given])
     back = read_episode(tmp_path / "back" / "data" / "episode0.hdf5")
     assert np.array_equal(back.state, given.state)
@@ -198,32 +158,15 @@ def test_an_original_file_goes_round_without_loss(tmp_path):
 def test_velocities_that_were_not_recorded_are_differences_of_the_joints(tmp_path, episode_file):
     given = read_episode(episode_file)
     find_format("original-act").write(tmp_path / "original", [given])
-    back = _read(tmp_path / "original" / "episode_0.hdf5", PROCESSED)
+    back = _read(tmp_path / "original" / "episode_0.hdf5", ACT_CAMERAS)
     assert np.allclose(back.extras["qvel"][4], (given.measured[4] - given.measured[3]) * 25, rtol=1e-5)
     find_format("act").write(tmp_path / "act", [given])
     with h5py.File(tmp_path / "act" / "episode_0.hdf5", "r+") as file:
         del file.attrs["control_hz"]
-    without_rate = _read(tmp_path / "act" / "episode_0.hdf5", PROCESSED)
+    without_rate = _read(tmp_path / "act" / "episode_0.hdf5", ACT_CAMERAS)
     with pytest.raises(DataError, match="control_hz"):
         find_format("original-act").write(tmp_path / "again", [without_rate])
     assert not list((tmp_path / "again").glob("*.hdf5"))
-
-
-def test_an_interrupted_conversion_goes_on_where_it_stopped(tmp_path, record, monkeypatch):
-    episodes = [read_episode(path) for path in sorted((record(tmp_path, count=3) / "data").glob("*.hdf5"))]
-    form, target = find_format("act"), tmp_path / "act"
-
-    def stop(index):
-        if index == 1:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        form.write(target, episodes, stop)
-    before = {path: path.stat().st_mtime_ns for path in target.iterdir()}
-    assert sorted(path.name for path in before) == ["episode_0.hdf5", "episode_1.hdf5"]
-    form.write(target, episodes)
-    assert all(path.stat().st_mtime_ns == then for path, then in before.items())
-    assert np.array_equal(_read(target / "episode_2.hdf5", PROCESSED).state, episodes[2].state)
 
 
 def test_a_folder_of_another_format_is_not_written_into(tmp_path, record):
@@ -232,63 +175,27 @@ def test_a_folder_of_another_format_is_not_written_into(tmp_path, record):
         find_format("act").write(folder, [read_episode(folder / "data" / "episode0.hdf5")])
 
 
-def _drop(key):
-    return lambda file: file.pop(key)
-
-
-def _put(key, values, **options):
-    def change(file):
-        del file[key]
-        file.create_dataset(key, data=values, **options)
-
-    return change
-
-
-def _never_stored(file):
-    del file["observations/images/cam_high"]
-    file.create_dataset("observations/images/cam_high", (8, 24, 32, 3), np.uint8, chunks=(1, 24, 32, 3))
-
-
-def _absurd(file):
-    del file["observations/images/cam_high"]
-    file.create_dataset("observations/images/cam_high", (8, 10**6, 10**6, 3), np.uint8, chunks=(1, 10, 10, 3))
-
-
-def _link(file):
-    del file["observations/images/cam_high"]
-    file["observations/images/cam_high"] = h5py.ExternalLink("/etc/passwd", "x")
-
-
 IMAGE = "observations/images/cam_high"
 HOSTILE = {
-    "other number of actions": (_put("action", np.zeros((9, 14), "f4")), r"action.*\(8, D\).*\(9, 14\)"),
-    "NaN": (_put("observations/qpos", np.full((8, 14), np.nan)), "qpos.*finite"),
-    "no rows": (_put("observations/qpos", np.zeros((0, 14))), "qpos.*at least 1 row"),
-    "absurd width": (_put("observations/qpos", np.zeros((8, 300))), "qpos"),
-    "camera missing": (_drop(IMAGE), "cam_high"),
-    "one picture short": (_put(IMAGE, np.zeros((7, 24, 32, 3), "u1")), f"{IMAGE}.*8 pictures.*7, 24, 32, 3"),
-    "grey": (_put(IMAGE, np.zeros((8, 24, 32), "u1")), f"{IMAGE}.*colour pictures.*choose cameras"),
-    "pictures as floats": (_put(IMAGE, np.zeros((8, 24, 32, 3), "f4")), f"{IMAGE}.*uint8.*float32"),
-    "never stored": (_never_stored, f"{IMAGE}.*stored completely.*0 bytes"),
-    "absurd size": (_absurd, f"{IMAGE}.*at most"),
+    "other number of actions": (replace("action", data=np.zeros((9, 14), "f4")), r"action.*\(8, D\).*\(9, 14\)"),
+    "no rows": (replace("observations/qpos", data=np.zeros((0, 14))), "qpos.*at least 1 row"),
+    "one picture short": (replace(IMAGE, data=np.zeros((7, 24, 32, 3), "u1")), f"{IMAGE}.*8 pictures.*7, 24, 32, 3"),
+    "grey": (replace(IMAGE, data=np.zeros((8, 24, 32), "u1")), f"{IMAGE}.*colour pictures.*choose cameras"),
+    "pictures as floats": (replace(IMAGE, data=np.zeros((8, 24, 32, 3), "f4")), f"{IMAGE}.*uint8.*float32"),
+    "never stored": (
+        replace(IMAGE, (8, 24, 32, 3), "u1", chunks=(1, 24, 32, 3)),
+        f"{IMAGE}.*stored completely.*0 bytes",
+    ),
+    "absurd size": (replace(IMAGE, (8, 10**6, 10**6, 3), "u1", chunks=(1, 10, 10, 3)), f"{IMAGE}.*at most"),
 }
 
 
 @pytest.mark.parametrize("case", HOSTILE)
 def test_damaged_and_foreign_content_is_one_clear_error(case, tmp_path):
-    path = tmp_path / "episode_0.hdf5"
-    _processed(path)
+    path = write_act(tmp_path, 1, steps=8) / "episode_0.hdf5"
     change, message = HOSTILE[case]
     with h5py.File(path, "r+") as file:
         change(file)
     with pytest.raises((DataError, ConfigError), match=message) as caught:
-        _read(path, PROCESSED)
+        _read(path, ACT_CAMERAS)
     assert str(path) in str(caught.value)
-
-
-def test_a_truncated_file_is_named(tmp_path):
-    path = tmp_path / "episode_0.hdf5"
-    _processed(path)
-    path.write_bytes(path.read_bytes()[:-5000])
-    with pytest.raises(DataError, match=r"episode_0\.hdf5.*truncated"):
-        detect(tmp_path)

@@ -337,25 +337,12 @@ def test_damaged_tables_are_one_clear_error(case, dataset):
 
 
 @pytest.mark.parametrize("name", [EPISODES, DATA])
-def test_overwritten_bytes_of_tables_never_give_anything_but_a_data_error(name, dataset):
-    good, rng, outcomes = (dataset / name).read_bytes(), np.random.default_rng(0), set()
-    cases = [good[: len(good) // 2], good[:-4], b"PAR1", b""]
-    for _ in range(40):
-        damaged = bytearray(good)
-        at = int(rng.integers(0, len(good) - 8))
-        damaged[at : at + 8] = rng.bytes(8)
-        cases.append(bytes(damaged))
-    for content in cases:
+def test_cut_tables_are_one_clear_error(name, dataset):
+    good = (dataset / name).read_bytes()
+    for content in (good[: len(good) // 2], good[:-4], b"PAR1", b""):
         (dataset / name).write_bytes(content)
-        try:
-            episode = read(dataset)
-            for step in range(episode.length):
-                episode.images(step)
-        except DataError:
-            outcomes.add("refused")
-        else:
-            outcomes.add("unharmed")
-    assert "refused" in outcomes
+        with pytest.raises(DataError, match=r"file-000\.parquet"):
+            read(dataset)
 
 
 VIDEO = "videos/observation.images.cam_high/chunk-000/file-000.mp4"
@@ -383,25 +370,6 @@ def test_missing_short_and_foreign_videos_are_one_clear_error(tmp_path):
     edit_info(folder, video_path="../{video_key}.mp4")
     with pytest.raises(DataError, match="inside the dataset"):
         read(folder)
-
-
-def test_overwritten_bytes_of_a_video_never_give_anything_but_a_data_error(tmp_path):
-    folder, rng, outcomes = write_dataset(tmp_path), np.random.default_rng(0), set()
-    good = (folder / VIDEO).read_bytes()
-    for _ in range(40):
-        damaged = bytearray(good)
-        at = int(rng.integers(0, len(good) - 8))
-        damaged[at : at + 8] = rng.bytes(8)
-        (folder / VIDEO).write_bytes(damaged)
-        try:
-            episode = read(folder, 1)
-            for step in (0, 7, 13, 2):
-                episode.images(step)
-        except DataError:
-            outcomes.add("refused")
-        else:
-            outcomes.add("readable")
-    assert "refused" in outcomes
 
 
 def test_without_the_extra_an_error_says_what_to_install(dataset, monkeypatch):

@@ -5,6 +5,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from foreign_files import poke, replace
 
 from ugr_lightning.data.formats import detect
 from ugr_lightning.data.formats.maniskill import ManiSkill
@@ -124,14 +125,6 @@ def test_trajectories_without_pictures_say_how_to_get_them(tmp_path):
                 use(tmp_path)
 
 
-def replace(key, *arguments, **options):
-    def damage(file):
-        del file[key]
-        file.create_dataset(key, *arguments, **options)
-
-    return damage
-
-
 def several_robots(file):
     del file["traj_0/actions"]
     file["traj_0/actions/left"] = joints(5)
@@ -143,7 +136,7 @@ HOSTILE = {
     "fewer actions than the JSON says": (replace("traj_0/actions", data=joints(4)), r"5 rows.*got 4"),
     "no actions": (replace("traj_0/actions", data=joints(0)), r"5 rows.*got 0"),
     "as many joints as actions": (replace("traj_0/obs/agent/qpos", data=joints(5)), r"qpos.*\(6, D\).*\(5, 14\)"),
-    "NaN": (lambda file: file["traj_0/actions"].__setitem__((1, 2), np.nan), r"actions.*nan at \[1, 2\]"),
+    "NaN": (poke("traj_0/actions", (1, 2), np.nan), r"actions.*nan at \[1, 2\]"),
     "fewer pictures": (replace(RGB, data=np.zeros((5, *SIZE, 3), np.uint8)), r"cam_high/rgb.*6 pictures"),
     "depth for colour": (replace(RGB, data=np.zeros((6, *SIZE, 1), np.uint16)), r"cam_high/rgb.*colour.*choose"),
     "success as numbers": (replace("traj_0/success", data=np.zeros(5)), r"success.*booleans"),

@@ -1,11 +1,12 @@
 """Demonstration files survive the round trip, and nothing damaged or foreign gets past the reader."""
 
+import dataclasses
 import io
-from dataclasses import replace
 
 import h5py
 import numpy as np
 import pytest
+from foreign_files import poke, replace
 from PIL import Image
 
 from ugr_lightning.data.folder import episode_path
@@ -93,7 +94,7 @@ def test_encoded_frames_are_stored_as_they_are(tmp_path, arrays):
     given = arrays(steps=2)
     jpegs = [encode_frame(frame) for frame in given["images"]]
     write_episode(episode_path(tmp_path, 0), **{**given, "images": jpegs})
-    assert read_episode(episode_path(tmp_path, 0)).frames.encoded(1) == jpegs[1]
+    assert read_episode(episode_path(tmp_path, 0)).frames.jpegs(1) == jpegs[1]
 
 
 def test_texts_are_stored_with_fixed_width_and_read_with_any(episode_file):
@@ -144,89 +145,28 @@ def test_a_failure_while_writing_leaves_no_file_and_keeps_the_old_one(tmp_path, 
     assert not episode_path(tmp_path, 1).exists()
 
 
-WRONG_ARGUMENTS = {
-    "commanded": np.zeros((12, 14)),
-    "measured": np.zeros((12, 14)),
-    "endpose": np.full((13, 2, 7), np.nan),
-    "contacts": np.zeros((13,), bool),
-    "expert_action": np.full((12, 14), np.inf),
-    "phase": ["reach"],
-    "slack": np.zeros(13),
-    "images": np.zeros((13, 3, 24, 32, 3), np.float32),
-    "camera_parameters": [],
-}
-WRONG_IMAGES = {
-    "too few": np.zeros((12, 3, 24, 32, 3), np.uint8),
-    "two cameras": np.zeros((13, 2, 24, 32, 3), np.uint8),
-    "grey": np.zeros((13, 3, 24, 32, 1), np.uint8),
-    "no JPEGs": [(b"x", b"y", b"z")] * 13,
-}
+WRONG = [
+    ("commanded", np.zeros((12, 14))),
+    ("measured", np.zeros((12, 14))),
+    ("endpose", np.full((13, 2, 7), np.nan)),
+    ("contacts", np.zeros((13,), bool)),
+    ("expert_action", np.full((12, 14), np.inf)),
+    ("phase", ["reach"]),
+    ("slack", np.zeros(13)),
+    ("camera_parameters", []),
+    ("images", np.zeros((13, 3, 24, 32, 3), np.float32)),
+    ("images", np.zeros((12, 3, 24, 32, 3), np.uint8)),
+    ("images", np.zeros((13, 2, 24, 32, 3), np.uint8)),
+    ("images", np.zeros((13, 3, 24, 32, 1), np.uint8)),
+    ("images", [(b"x", b"y", b"z")] * 13),
+]
 
 
-@pytest.mark.parametrize("case", WRONG_IMAGES)
-def test_wrong_images_are_refused_before_anything_is_written(case, tmp_path, arrays):
-    with pytest.raises(DataError, match="images"):
-        write_episode(episode_path(tmp_path, 0), **arrays(images=WRONG_IMAGES[case]))
-    assert not list(tmp_path.rglob("*.*"))
-
-
-@pytest.mark.parametrize("name", WRONG_ARGUMENTS)
-def test_wrong_arguments_are_refused_before_anything_is_written(name, tmp_path, arrays):
+@pytest.mark.parametrize(("name", "value"), WRONG)
+def test_wrong_arguments_are_refused_before_anything_is_written(name, value, tmp_path, arrays):
     with pytest.raises(DataError, match=name):
-        write_episode(episode_path(tmp_path, 0), **arrays(**{name: WRONG_ARGUMENTS[name]}))
+        write_episode(episode_path(tmp_path, 0), **arrays(**{name: value}))
     assert not list(tmp_path.rglob("*.*"))
-
-
-def _replace(key, values, **options):
-    def damage(file):
-        del file[key]
-        file.create_dataset(key, data=values, **options)
-
-    return damage
-
-
-def _poke(key, where, value):
-    def damage(file):
-        file[key][where] = value
-
-    return damage
-
-
-def _declare(key, shape, dtype):
-    def damage(file):
-        del file[key]
-        file.create_dataset(key, shape, dtype, chunks=(1, *shape[1:]))
-
-    return damage
-
-
-def _link(key, link):
-    def damage(file):
-        del file[key]
-        file[key] = link
-
-    return damage
-
-
-def _external_storage(file):
-    del file[VECTOR]
-    file.create_dataset(VECTOR, (13, 14), np.float64, external=[("/dev/zero", 0, 13 * 14 * 8)])
-
-
-def _virtual(file):
-    del file[VECTOR]
-    layout = h5py.VirtualLayout((13, 14), np.float64)
-    layout[:] = h5py.VirtualSource("elsewhere.hdf5", "x", (13, 14))
-    file.create_virtual_dataset(VECTOR, layout)
-
-
-def _other_size(file):
-    del file[HEAD]
-    file[HEAD] = np.array([encode_jpeg(np.zeros((16, 16, 3), np.uint8))] * 13)
-
-
-def _one_other_size(file):
-    file[HEAD][5] = encode_jpeg(np.zeros((16, 16, 3), np.uint8))
 
 
 def _group_instead(file):
@@ -238,33 +178,39 @@ HOSTILE = {
     "vector missing": (lambda file: file.pop(VECTOR), f"{VECTOR}.*left_arm"),
     "vector renamed": (lambda file: file.move(VECTOR, "joint_action/vektor"), f"{VECTOR}.*vektor"),
     "vector a group": (_group_instead, f"{VECTOR}.*group"),
-    "vector of strings": (_replace(VECTOR, np.full((13, 14), b"0.5")), f"{VECTOR}.*S3"),
-    "vector of 7-joint arms": (_replace(VECTOR, np.zeros((13, 16))), VECTOR + r".*\(12, 16\).*layout.state 16"),
-    "vector flat": (_replace(VECTOR, np.zeros(13 * 14)), VECTOR + r".*\(182,\)"),
-    "vector a scalar": (_replace(VECTOR, 1.0), VECTOR + r".*\(\)"),
-    "vector without content": (_replace(VECTOR, h5py.Empty("f8")), f"{VECTOR}.*None"),
-    "no frames": (_replace(VECTOR, np.zeros((0, 14))), f"{VECTOR}.*at least 2 frames, got 0"),
-    "one frame": (_replace(VECTOR, np.zeros((1, 14))), f"{VECTOR}.*at least 2 frames, got 1"),
-    "other number of frames": (_replace(VECTOR, np.zeros((12, 14))), "expert_action|head_camera"),
-    "NaN": (_poke(VECTOR, (3, 7), np.nan), VECTOR + r".*finite.*nan at \[3, 7\]"),
-    "infinity": (_poke(VECTOR, (0, 0), -np.inf), VECTOR + r".*-inf at \[0, 0\]"),
-    "beyond float32": (_poke(VECTOR, (12, 13), 1e300), VECTOR + r".*inf at \[12, 13\]"),
-    "absurd length": (_declare(VECTOR, (10**12, 14), np.float64), f"{VECTOR}.*at most 100000 frames"),
-    "absurd chunk": (_replace(VECTOR, np.zeros((13, 14)), chunks=(10**6, 14), maxshape=(None, 14)), f"{VECTOR}.*chunk"),
+    "vector of strings": (replace(VECTOR, data=np.full((13, 14), b"0.5")), f"{VECTOR}.*S3"),
+    "vector of 7-joint arms": (replace(VECTOR, data=np.zeros((13, 16))), VECTOR + r".*\(12, 16\).*layout.state 16"),
+    "vector flat": (replace(VECTOR, data=np.zeros(13 * 14)), VECTOR + r".*\(182,\)"),
+    "vector a scalar": (replace(VECTOR, data=1.0), VECTOR + r".*\(\)"),
+    "vector without content": (replace(VECTOR, data=h5py.Empty("f8")), f"{VECTOR}.*None"),
+    "no frames": (replace(VECTOR, data=np.zeros((0, 14))), f"{VECTOR}.*at least 2 frames, got 0"),
+    "one frame": (replace(VECTOR, data=np.zeros((1, 14))), f"{VECTOR}.*at least 2 frames, got 1"),
+    "other number of frames": (replace(VECTOR, data=np.zeros((12, 14))), "expert_action|head_camera"),
+    "NaN": (poke(VECTOR, (3, 7), np.nan), VECTOR + r".*finite.*nan at \[3, 7\]"),
+    "infinity": (poke(VECTOR, (0, 0), -np.inf), VECTOR + r".*-inf at \[0, 0\]"),
+    "beyond float32": (poke(VECTOR, (12, 13), 1e300), VECTOR + r".*inf at \[12, 13\]"),
+    "absurd length": (replace(VECTOR, (10**12, 14), np.float64, chunks=(1, 14)), f"{VECTOR}.*at most 100000 frames"),
+    "absurd chunk": (
+        replace(VECTOR, data=np.zeros((13, 14)), chunks=(10**6, 14), maxshape=(None, 14)),
+        f"{VECTOR}.*chunk",
+    ),
     "camera missing": (lambda file: file.pop("observation/head_camera"), "cam_left_wrist, got cam_high"),
     "pictures missing": (lambda file: file.pop(HEAD), f"{HEAD}.*no 'rgb'"),
-    "pictures as numbers": (_replace(HEAD, np.zeros(13)), f"{HEAD}.*colour pictures.*float64"),
-    "pictures of absurd size": (_declare(HEAD, (13,), "S300000000"), f"{HEAD}.*rows of at most"),
-    "one picture short": (_replace(HEAD, np.array([b"x"] * 12)), HEAD + r".*13 pictures.*\(12,\)"),
-    "no JPEG": (_poke(HEAD, 4, b"GIF89a"), HEAD + r"\[4\].*JPEG"),
-    "empty picture": (_poke(HEAD, 12, b""), HEAD + r"\[12\].*JPEG"),
-    "JPEG markers around nothing": (_poke(HEAD, 0, b"\xff\xd8junk\xff\xd9"), HEAD + r"\[0\].*JPEG"),
-    "a picture of another size": (_one_other_size, HEAD + r"\[5\].*\(24, 32\).*\(16, 16\)"),
-    "expert action too long": (_replace("ugr/expert_action", np.zeros((13, 14))), "expert_action.*12"),
-    "NaN in expert action": (_poke("ugr/expert_action", (1, 1), np.nan), "expert_action.*finite"),
-    "measured of another length": (_replace("ugr/measured", np.zeros((12, 14))), "measured.*13"),
-    "contacts as numbers": (_replace("ugr/contacts", np.zeros((13, 2))), "contacts.*booleans"),
-    "phases as numbers": (_replace("ugr/phase", np.zeros(12)), "phase.*texts"),
+    "pictures as numbers": (replace(HEAD, data=np.zeros(13)), f"{HEAD}.*colour pictures.*float64"),
+    "pictures of absurd size": (replace(HEAD, (13,), "S300000000", chunks=(1,)), f"{HEAD}.*rows of at most"),
+    "one picture short": (replace(HEAD, data=np.array([b"x"] * 12)), HEAD + r".*13 pictures.*\(12,\)"),
+    "no JPEG": (poke(HEAD, 4, b"GIF89a"), HEAD + r"\[4\].*JPEG"),
+    "empty picture": (poke(HEAD, 12, b""), HEAD + r"\[12\].*JPEG"),
+    "JPEG markers around nothing": (poke(HEAD, 0, b"\xff\xd8junk\xff\xd9"), HEAD + r"\[0\].*JPEG"),
+    "a picture of another size": (
+        poke(HEAD, 5, encode_jpeg(np.zeros((16, 16, 3), np.uint8))),
+        HEAD + r"\[5\].*\(24, 32\).*\(16, 16\)",
+    ),
+    "expert action too long": (replace("ugr/expert_action", data=np.zeros((13, 14))), "expert_action.*12"),
+    "NaN in expert action": (poke("ugr/expert_action", (1, 1), np.nan), "expert_action.*finite"),
+    "measured of another length": (replace("ugr/measured", data=np.zeros((12, 14))), "measured.*13"),
+    "contacts as numbers": (replace("ugr/contacts", data=np.zeros((13, 2))), "contacts.*booleans"),
+    "phases as numbers": (replace("ugr/phase", data=np.zeros(12)), "phase.*texts"),
     "seed no number": (lambda file: file.attrs.__setitem__("seed", np.bytes_(b"many")), "@seed.*int.*many"),
     "format of the future": (lambda file: file.attrs.__setitem__("ugr_format_version", 99), "version 99.*Update"),
 }
@@ -378,8 +324,9 @@ def test_seven_joints_per_arm_are_named_and_picked(tmp_path):
     vector = np.random.default_rng(0).normal(size=(6, 16)).astype(np.float32)
     names = form.peek(location).state
     assert (len(names), names[6:9]) == (16, ("left_joint_7", "left_gripper", "right_joint_1"))
-    with pytest.raises(DataError, match=r"\(T, 14\).*\(5, 16\).*--data.layout.state 16"):
+    with pytest.raises(DataError, match=r"\(T, 14\).*\(5, 16\).*--data.layout.state 16") as caught:
         form.read(location, CAMERAS)
+    assert "ugr collect" not in str(caught.value)
     whole = form.read(location, CAMERAS, form.peek(location).layout)
     assert np.array_equal(whole.state, vector[:-1])
     right = tuple(name for name in names if name.startswith("right"))
@@ -393,23 +340,14 @@ def test_arms_that_do_not_fit_the_vector_only_cost_the_names(arm, tmp_path):
     form = detect(_theirs(tmp_path, "episode{i}.hdf5"))
     location = form.find(tmp_path)[0]
     with h5py.File(location.path, "r+") as file:
-        _replace("joint_action/left_arm", arm)(file)
+        replace("joint_action/left_arm", data=arm)(file)
     assert form.peek(location).state == tuple(map(str, range(14)))
     assert form.read(location, CAMERAS).length == 5
 
 
-def test_a_recording_is_rewritten_in_the_same_bytes_of_pictures_and_numbers(tmp_path, episode_file):
-    given = read_episode(episode_file)
-    find_format("robotwin").write(tmp_path / "again", [given])
-    again = read_episode(episode_path(tmp_path / "again", 0))
-    assert np.array_equal(again.state, given.state)
-    assert np.array_equal(again.action, given.action)
-    assert [again.frames.encoded(t) for t in range(12)] == [given.frames.encoded(t) for t in range(12)]
-    assert (again.seed, again.extras["task"], again.extras["control_hz"]) == (0, "click_alarmclock", 25.0)
-
-
 def test_an_episode_of_one_arm_cannot_be_written(tmp_path, episode_file):
-    given = replace(read_episode(episode_file), state=np.zeros((12, 7), "f4"), action=np.zeros((12, 7), "f4"))
+    arms = {"state": np.zeros((12, 7), "f4"), "action": np.zeros((12, 7), "f4")}
+    given = dataclasses.replace(read_episode(episode_file), **arms)
     with pytest.raises(DataError, match=r"two arms, each with a gripper.*got 7 states, 7 actions"):
         find_format("robotwin").write(tmp_path / "again", [given])
     assert not list((tmp_path / "again").rglob("*.hdf5"))

@@ -6,6 +6,7 @@ import json
 import h5py
 import numpy as np
 import pytest
+from foreign_files import poke, replace
 from PIL import Image
 
 from ugr_lightning.data.formats import detect
@@ -216,26 +217,9 @@ def test_a_single_arm_and_other_cameras_are_read_through_a_layout(native):
         read(native, cameras=("cam_top",), layout=layout)
 
 
-def replace(key, *arguments, **options):
-    def damage(file):
-        del file[key]
-        file.create_dataset(key, *arguments, **options)
-
-    return damage
-
-
-def poke(key, where, value):
-    return lambda file: file[key].__setitem__(where, value)
-
-
 def no_rows(file):
     for part in PARTS:
         replace(f"state/{part}", data=np.zeros((0, 6), np.float32))(file)
-
-
-def link(file):
-    del file["action/left_arm_joint_states"]
-    file["action/left_arm_joint_states"] = h5py.ExternalLink("/etc/passwd", "x")
 
 
 VERSION, COLORS, FREQUENCY = "data_format_version", "vision/cam_head/colors", "additional_info/frequency"

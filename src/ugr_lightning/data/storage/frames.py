@@ -23,7 +23,11 @@ class FrameSource(ABC):
 
     @abstractmethod
     def read(self, step: int, out: np.ndarray) -> None:
-        """Write the pictures of one step into `out`, (V, H, W, 3) uint8 RGB, contiguous."""
+        """Write the pictures of one step into `out`, (V, H, W, 3) uint8 RGB, contiguous.
+
+        Raises:
+            DataError: a damaged picture, one of another size, or a file that changed after it was checked.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -67,30 +71,24 @@ class SeveralSources(FrameSource):
 
     @property
     def image_sizes(self) -> tuple[tuple[int, int], ...]:
-        """Stored (height, width) of each camera."""
         return tuple(source.image_size for source in self.sources)
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The files of all cameras, each once."""
         return tuple(dict.fromkeys(path for source in self.sources for path in source.files))
 
     def pictures(self, step: int) -> list[np.ndarray]:
-        """The pictures of one step at the sizes they have."""
         return [picture for source in self.sources for picture in source.pictures(step)]
 
     def jpegs(self, step: int) -> tuple[bytes, ...] | None:
-        """The JPEGs of all cameras, where all have them."""
         kept = [source.jpegs(step) for source in self.sources]
         return None if any(one is None for one in kept) else tuple(jpeg for one in kept for jpeg in one or ())
 
     def read(self, step: int, out: np.ndarray) -> None:
-        """Write the pictures of one step into `out`, at its size."""
         for picture, row in zip(self.pictures(step), out, strict=True):
             shrink(picture, row)
 
     def close(self) -> None:
-        """Let go of all files."""
         for source in self.sources:
             source.close()
 

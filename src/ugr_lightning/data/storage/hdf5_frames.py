@@ -36,7 +36,6 @@ class Hdf5Frames(FrameSource):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The one file."""
         return (self.path,)
 
     def _dataset(self, key: str) -> h5py.Dataset:
@@ -48,17 +47,12 @@ class Hdf5Frames(FrameSource):
         return datasets[key]
 
     def close(self) -> None:
-        """Close the file; the next read opens it again."""
         if self._opened is not None and self._opened[0] == os.getpid():
             self._opened[1].close()
         self._opened = None
 
     def _rows(self, step: int, keys: Sequence[str]) -> list[Any]:
-        """What some datasets hold for one step.
-
-        Raises:
-            DataError: the file changed or became unreadable after it was checked.
-        """
+        """What some datasets hold for one step."""
         try:
             return [self._dataset(key)[step] for key in keys]
         except (OSError, RuntimeError, KeyError, ValueError, IndexError) as error:
@@ -68,25 +62,12 @@ class Hdf5Frames(FrameSource):
 class JpegFrames(Hdf5Frames):
     """JPEG frames in an HDF5 file, one dataset per camera: bytes, or rows of bytes with zeros behind."""
 
-    def encoded(self, step: int) -> tuple[bytes, ...]:
-        """The JPEG bytes of one step, one item per camera.
-
-        Raises:
-            DataError: the file changed or became unreadable after it was checked.
-        """
-        return tuple(_jpeg(row) for row in self._rows(step, self.keys))
-
     def jpegs(self, step: int) -> tuple[bytes, ...]:
         """The stored bytes."""
-        return self.encoded(step)
+        return tuple(_jpeg(row) for row in self._rows(step, self.keys))
 
     def read(self, step: int, out: np.ndarray) -> None:
-        """Decode one step into `out`.
-
-        Raises:
-            DataError: a frame that is no JPEG of the episode's size.
-        """
-        for key, data, picture in zip(self.keys, self.encoded(step), out, strict=True):
+        for key, data, picture in zip(self.keys, self.jpegs(step), out, strict=True):
             try:
                 decode_jpeg(data, picture)
             except ValueError as error:
@@ -124,11 +105,6 @@ class RawFrames(Hdf5Frames):
         return kept
 
     def read(self, step: int, out: np.ndarray) -> None:
-        """Copy one step into `out`.
-
-        Raises:
-            DataError: the file changed or became unreadable after it was checked.
-        """
         for row, picture in zip(self._rows(step, self.keys), out, strict=True):
             picture[:] = row
 
@@ -143,13 +119,14 @@ def hdf5_frames(file: h5py.File, keys: Sequence[str], frames: int, origins: Sequ
         origins: for plain pictures, the datasets of the JPEGs they were decoded from.
 
     Raises:
-        DataError: see `check_jpegs` and `check_raw`.
+        DataError: another number or type of pictures, one that is no JPEG, pictures of different or absurd sizes, or
+            plain pictures that were declared and never stored.
     """
     path = Path(file.filename)
-    encoded = [is_encoded(find_dataset(file, key)) for key in keys]
-    sizes = [(check_jpegs if one else check_raw)(file, key, frames) for one, key in zip(encoded, keys, strict=True)]
+    encoded = [_is_encoded(find_dataset(file, key)) for key in keys]
+    sizes = [(_check_jpegs if one else _check_raw)(file, key, frames) for one, key in zip(encoded, keys, strict=True)]
     for key in origins:
-        check_jpegs(file, key, frames)
+        _check_jpegs(file, key, frames)
 
     def source(first: int, last: int) -> FrameSource:
         if encoded[first]:
@@ -173,14 +150,14 @@ def colour_cameras(file: h5py.File, keys: Mapping[str, str]) -> tuple[tuple[str,
         found = file.get(key) if has_key(file, key) else None
         if not isinstance(found, h5py.Dataset):
             others[camera] = "no pictures"
-        elif is_encoded(found) or _is_plain(found):
+        elif _is_encoded(found) or _is_plain(found):
             colour.append(camera)
         else:
             others[camera] = f"{found.dtype} {found.shape}"
     return tuple(colour), others
 
 
-def is_encoded(found: h5py.Dataset) -> bool:
+def _is_encoded(found: h5py.Dataset) -> bool:
     """Whether a dataset holds one encoded picture a row: bytes, or rows of bytes of one or of any length."""
     rows = len(found.shape or ())
     if rows == 1:
@@ -197,22 +174,10 @@ def _jpeg(row: Any) -> bytes:
     return bytes(row).rstrip(b"\0")
 
 
-def check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
-    """Check every frame of a camera by its header and end marker.
-
-    Args:
-        file: open file.
-        key: dataset of JPEGs, see `is_encoded`.
-        frames: how many there have to be.
-
-    Returns:
-        Their common (height, width).
-
-    Raises:
-        DataError: another number or type, a frame that is no JPEG, or frames of different or absurd sizes.
-    """
+def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
+    """The (height, width) that the frames of a camera have, each checked by its header and end marker."""
     found, where = find_dataset(file, key), f"{file.filename}:{key}"
-    if not is_encoded(found):
+    if not _is_encoded(found):
         raise DataError(where, "encoded colour pictures", f"{found.shape} {found.dtype}", CHOOSE)
     if found.shape[0] != frames:
         raise DataError(where, f"{frames} pictures, one per row of joints", found.shape, FIX)
@@ -229,20 +194,8 @@ def check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
     return sizes[0]
 
 
-def check_raw(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
-    """Check that a camera has its frames as plain numbers, without reading them.
-
-    Args:
-        file: open file.
-        key: dataset (frames, H, W, 3) uint8.
-        frames: how many there have to be.
-
-    Returns:
-        Their (height, width).
-
-    Raises:
-        DataError: another shape or type, an absurd size, or frames that were declared and never stored.
-    """
+def _check_raw(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
+    """The (height, width) of frames that are plain numbers, checked without reading them."""
     found, where = find_dataset(file, key), f"{file.filename}:{key}"
     shape = tuple(found.shape or ())
     if not _is_plain(found):

@@ -176,34 +176,25 @@ class TablePictures(FrameSource):
         path: the file.
         columns: one per camera.
         rows: first and past-the-last row of the episode.
-        image_size: (height, width) that every picture has; None to find out from the first.
 
     Raises:
         DataError: pictures that are missing, of another kind, or of different sizes.
     """
 
-    def __init__(
-        self, path: Path, columns: Sequence[str], rows: tuple[int, int], image_size: tuple[int, int] | None = None
-    ) -> None:
+    def __init__(self, path: Path, columns: Sequence[str], rows: tuple[int, int]) -> None:
         self.path, self.columns, self.rows = path, tuple(columns), rows
         self.keys = tuple(f"{column}[{rows[0]}:{rows[1]}]" for column in columns)
         self._encoded: list[list[bytes]] | None = None
-        self.image_size = image_size or self._check()
+        self.image_size = self._check()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_encoded": None}
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The one file."""
         return (self.path,)
 
     def read(self, step: int, out: np.ndarray) -> None:
-        """Decode one step into `out`.
-
-        Raises:
-            DataError: a picture that is damaged, or not of the episode's size.
-        """
         for column, pictures, picture in zip(self.columns, self._load(), out, strict=True):
             where = f"{self.path}:{column}[{step}]"
             try:
@@ -215,7 +206,6 @@ class TablePictures(FrameSource):
                 raise DataError(where, "a picture", str(error)[:120], FIX) from error
 
     def close(self) -> None:
-        """Forget the encoded pictures; the next read loads them again."""
         self._encoded = None
 
     def _load(self) -> list[list[bytes]]:
