@@ -209,11 +209,7 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
 
 
 def _description(path: Path, content: dict[str, Any]) -> dict[str, Any]:
-    """What a checkpoint says about its policy, once it is clear that it says all that is relied on.
-
-    Raises:
-        CheckpointError: it lacks something, or is of a newer format.
-    """
+    """What a checkpoint says about its policy, once it is clear that it says all that is relied on."""
     description = content.get("policy")
     if not isinstance(description, dict) or not isinstance(content.get("state_dict"), dict):
         fix = "Use a checkpoint from `ugr fit`; foreign ones go through the bridges."

@@ -110,11 +110,9 @@ class Zero(Actor):
         self._home: dict[int, np.ndarray] = {}
 
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
-        """Remember the pose."""
         self._home[slot] = np.tile(np.asarray(frame.commanded, np.float32), (HELD_STEPS, 1))  # (n, A)
 
     def act(self, frames: Mapping[int, FrameView]) -> dict[int, Decision]:
-        """The remembered pose, for a while."""
         return {slot: Decision(self._home[slot]) for slot in frames}
 
 
@@ -133,11 +131,9 @@ class Random(Actor):
         self._slots: dict[int, tuple[np.random.Generator, np.ndarray]] = {}
 
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
-        """Seed the episode's random numbers."""
         self._slots[slot] = (np.random.default_rng(seed), np.array(frame.commanded, np.float32))
 
     def act(self, frames: Mapping[int, FrameView]) -> dict[int, Decision]:
-        """The next pose, held."""
         return {slot: Decision(self._pose(*self._slots[slot])) for slot in frames}
 
     def _pose(self, random: np.random.Generator, home: np.ndarray) -> np.ndarray:
@@ -156,7 +152,6 @@ class Expert(Actor):
         """Nothing to do: the expert lives in the simulator."""
 
     def act(self, frames: Mapping[int, FrameView]) -> dict[int, Decision]:
-        """No command of its own."""
         return dict.fromkeys(frames, Decision(None))
 
 
@@ -220,11 +215,9 @@ class PolicyActor(Actor):
         policy.eval()
 
     def end(self) -> None:
-        """Put the policy back into the mode it was in."""
         self.policy.train(self._was_training)
 
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
-        """Forget the slot's chunks and observations."""
         assert self._execution is not None
         self._execution.reset(slot)
         self._new.add(slot)
@@ -301,11 +294,7 @@ class PolicyActor(Actor):
     def _predict(
         self, images: torch.Tensor, state: torch.Tensor, projection: torch.Tensor | None
     ) -> tuple[np.ndarray | None, ...]:
-        """What is predicted from images (B, T, V, H, W, 3), states (B, T, S) and their calibration (B, T, V, 3, 4).
-
-        Returns:
-            Chunks (B, K, A), s_k (B, K), maps (B, V, 2, 2, h, w) of all cameras that there are, points (B, 2, 2, 3).
-        """
+        """Chunks, s_k, maps of all cameras and points, from (B, T, V, H, W, 3), (B, T, S) and (B, T, V, 3, 4)."""
         images, state = images.to(self._device), state.to(self._device)
         projection = None if projection is None else projection.to(self._device)
         if self.policy.observation_steps == 1:

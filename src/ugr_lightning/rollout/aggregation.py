@@ -74,12 +74,10 @@ class TemporalAggregation(Execution):
         self._counts = np.zeros((slots, chunk_length))
 
     def reset(self, slot: int) -> None:
-        """Forget everything about a slot."""
         for table in (self._sums, self._weights, self._counts):
             table[slot] = 0.0
 
     def needs_query(self, slot: int) -> bool:
-        """Always: every step is predicted anew."""
         return True
 
     def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
@@ -101,7 +99,6 @@ class TemporalAggregation(Execution):
         self._counts[slot] += 1
 
     def next(self, slot: int) -> np.ndarray:
-        """The weighted average (A,) for the current step; moves on by one step."""
         if self._counts[slot, 0] == 0:
             raise RuntimeError(f"slot {slot} has no prediction for its current step: push a chunk first")
         action = self._sums[slot, 0] / self._weights[slot, 0]  # (A,)
@@ -126,23 +123,18 @@ class ChunkExecution(Execution):
         self._cursors = [0] * slots
 
     def reset(self, slot: int) -> None:
-        """Forget the slot's chunk."""
         self._chunks[slot] = None
 
     def needs_query(self, slot: int) -> bool:
-        """True at the start of an episode and whenever the steps of the last chunk are used up."""
         return self.steps_left(slot) == 0
 
     def steps_left(self, slot: int) -> int:
-        """The steps of the last chunk that have not been executed."""
         return 0 if self._chunks[slot] is None else self._steps - self._cursors[slot]
 
     def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
-        """Replace the slot's chunk by a new one (K, A)."""
         self._chunks[slot], self._cursors[slot] = np.array(chunk, np.float32), 0
 
     def next(self, slot: int) -> np.ndarray:
-        """The next action (A,) of the slot's chunk."""
         chunk = self._chunks[slot]
         if chunk is None or self.needs_query(slot):
             raise RuntimeError(f"slot {slot} has used up its chunk: push a new one first")
@@ -173,7 +165,6 @@ class AdaptiveExecution(ChunkExecution):
         self._horizons = [0] * slots
 
     def steps_left(self, slot: int) -> int:
-        """The steps of the last chunk that are to be executed and have not been."""
         return 0 if self._chunks[slot] is None else self._horizons[slot] - self._cursors[slot]
 
     def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:

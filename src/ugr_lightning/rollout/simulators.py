@@ -3,7 +3,6 @@
 import time
 from collections import deque
 from functools import partial
-from types import TracebackType
 from typing import Self
 
 from ugr_lightning.rollout.spec import RolloutSpec
@@ -21,9 +20,7 @@ class Simulators:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def open(self, spec: RolloutSpec, render: bool) -> "Crew":

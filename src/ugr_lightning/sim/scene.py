@@ -156,7 +156,6 @@ class TwoArmEnv(BaseEnv):
         return CameraConfig("render_camera", pose, 512, 384, np.deg2rad(55), 0.01, 5.0, shader_config=shader)
 
     def reset(self, seed: int | list[int] | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Build a new episode; see `BaseEnv.reset`."""
         if seed is not None:  # for users of `np_random`; the scene's random numbers are those of the seed alone
             gymnasium.Env.reset(self, seed=int(np.ravel(seed)[0]))
         return super().reset(seed=seed, options={**(options or {}), "reconfigure": True})

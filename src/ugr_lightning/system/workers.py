@@ -14,7 +14,6 @@ import time
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing import Pipe, connection
-from types import TracebackType
 from typing import Any, Self
 
 from ugr_lightning.errors import SimulationError, UGRError
@@ -51,9 +50,7 @@ class Worker:
         self.launch()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.kill()
 
     @property

@@ -11,7 +11,6 @@ class AtomicCheckpointIO(TorchCheckpointIO):
     """Checkpoints that are whole or absent, read without running any code."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write one checkpoint; see `write_checkpoint`."""
         write_checkpoint(path, checkpoint)
 
     def load_checkpoint(self, path: Any, map_location: Any = None, weights_only: bool | None = None) -> dict[str, Any]:

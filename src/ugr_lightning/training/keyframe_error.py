@@ -22,7 +22,6 @@ class MedianMetric(CatMetric):
     """The median of everything it was given; NaN of nothing."""
 
     def compute(self) -> Tensor:
-        """The median, a scalar."""
         values = super().compute()
         return values.median() if isinstance(values, Tensor) and values.numel() else torch.tensor(torch.nan)
 

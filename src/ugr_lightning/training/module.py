@@ -81,7 +81,7 @@ class PolicyModule(LightningModule):
         terms = self.policy.losses(batch)
         if not torch.stack(list(terms.values())).isfinite().all():
             raise self._not_finite(batch, terms)
-        if logs_now(self.trainer):
+        if _logs_now(self.trainer):
             rate = self.trainer.optimizers[0].param_groups[0]["lr"]
             shown = {**terms, "learning_rate": rate}
             self.log_dict({f"train/{name}": value for name, value in shown.items()}, batch_size=len(batch.state))
@@ -195,12 +195,8 @@ class PolicyModule(LightningModule):
         )
 
 
-def logs_now(trainer: Trainer) -> bool:
-    """Whether anybody reads what this training step logs: the loggers, or what follows the last batch of an epoch.
-
-    Args:
-        trainer: the trainer in its training loop.
-    """
+def _logs_now(trainer: Trainer) -> bool:
+    """Whether anybody reads what this training step logs: the loggers, or what follows the last batch of an epoch."""
     every = trainer.log_every_n_steps  # type: ignore[attr-defined]
     return trainer.is_last_batch or bool(every and (trainer.global_step + 1) % every == 0)
 

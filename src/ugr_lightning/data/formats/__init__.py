@@ -147,7 +147,6 @@ class NumberedFiles(EpisodeFormat):
         """Whether an open file is of this format."""
 
     def recognises(self, folder: Path) -> bool:
-        """Whether one of the first files is of this format."""
         try:
             paths = list(episode_files(folder).values())[:PEEKED]
         except DataError:
@@ -155,7 +154,6 @@ class NumberedFiles(EpisodeFormat):
         return any(self._is_one(path) for path in paths)
 
     def find(self, folder: Path) -> dict[int, EpisodeLocation]:
-        """The numbered files, by number."""
         return {index: EpisodeLocation(path) for index, path in episode_files(folder).items()}
 
     def write(

@@ -33,7 +33,6 @@ class ProcessedAct(NumberedFiles):
     """Whether frames are stored one by one, or in one block."""
 
     def matches(self, file: h5py.File) -> bool:
-        """Whether it has ACT's keys without those of the original."""
         return all(has_key(file, key) for key in (QPOS, ACTION, IMAGES)) and not is_original(file)
 
     def peek(self, location: EpisodeLocation) -> Contents:

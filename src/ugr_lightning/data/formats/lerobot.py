@@ -112,7 +112,6 @@ class LeRobot(EpisodeFormat):
     def write(
         self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None
     ) -> None:
-        """Write a dataset, see `lerobot_files.write_dataset`."""
         write_dataset(Path(folder), episodes, done)
 
 

@@ -117,11 +117,7 @@ def _trajectories(path: Path) -> list[int]:
 
 
 def _find_cameras(file: h5py.File, location: EpisodeLocation) -> tuple[tuple[str, ...], dict[str, str]]:
-    """The cameras of a trajectory that give colour pictures, and what the others give.
-
-    Raises:
-        DataError: there is none that does.
-    """
+    """The cameras of a trajectory that give colour pictures, and what the others give."""
     key = f"{location.key}/{CAMERAS}"
     cameras, others = colour_cameras(file, {name: f"{key}/{name}/rgb" for name in list_keys(file, key)})
     if not cameras or not has_key(file, f"{location.key}/{QPOS}"):
@@ -159,11 +155,7 @@ def _is_trainable(path: Path) -> bool:
 
 
 def _about(location: EpisodeLocation) -> dict[str, Any]:
-    """What the JSON file says of a trajectory, checked for the control mode.
-
-    Raises:
-        DataError: it says nothing of it, or actions that are no absolute joint targets.
-    """
+    """What the JSON file says of a trajectory, checked for the control mode."""
     path = location.path
     about = _episodes_of(path).get(int(str(location.key).removeprefix("traj_")))
     if about is None:
@@ -187,11 +179,7 @@ def _json_path(path: Path) -> Path:
 
 
 def _episodes_of(path: Path) -> dict[int, dict[str, Any]]:
-    """Entries of the JSON file beside an HDF5 file, by number of the trajectory.
-
-    Raises:
-        DataError: missing, or not what `RecordEpisode` writes.
-    """
+    """Entries of the JSON file beside an HDF5 file, by number of the trajectory."""
     beside = _json_path(path)
     if not beside.is_file():
         raise DataError(beside, "the JSON file beside the trajectories", "no such file", "Copy it there, too.")

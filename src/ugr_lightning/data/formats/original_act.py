@@ -25,7 +25,6 @@ class OriginalAct(ProcessedAct):
     chunked = True
 
     def matches(self, file: h5py.File) -> bool:
-        """Whether it has ACT's keys and one that only the original writes."""
         return all(has_key(file, key) for key in (QPOS, ACTION, IMAGES)) and is_original(file)
 
     def _read_further(self, file: h5py.File, state: np.ndarray) -> tuple[np.ndarray | None, dict[str, Any]]:

@@ -256,7 +256,6 @@ class RoboTwin(NumberedFiles):
     marks = "`joint_action/vector`, `observation`"
 
     def matches(self, file: h5py.File) -> bool:
-        """Whether it has the group that no other format has."""
         return has_key(file, "joint_action")
 
     def find(self, folder: Path) -> dict[int, EpisodeLocation]:
@@ -273,11 +272,9 @@ class RoboTwin(NumberedFiles):
             return Contents(policy_cameras(cameras), names, names, others)
 
     def read(self, location: EpisodeLocation, cameras: Sequence[str], layout: Layout = DEFAULT_LAYOUT) -> Episode:
-        """See `read_episode`."""
         return read_episode(location.path, cameras, seed=location.seed, layout=layout)
 
     def episode_file(self, folder: Path, index: int) -> Path:
-        """RoboTwin's own place and spelling."""
         return episode_path(folder, index)
 
     def fill(self, file: h5py.File, episode: Episode) -> None:

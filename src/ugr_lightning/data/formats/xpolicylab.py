@@ -46,7 +46,6 @@ class XPolicyLab(NumberedFiles):
     marks = "`vision/<camera>/colors`, `state/*_joint_states`"
 
     def matches(self, file: h5py.File) -> bool:
-        """Whether it has cameras and joints where trajectory v1.0 has them."""
         return bool(list_keys(file, "vision")) and any(has_key(file, f"state/{part}") for part in PARTS)
 
     def peek(self, location: EpisodeLocation) -> Contents:
@@ -163,11 +162,7 @@ def _unpack(texts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
-    """`conversion_meta.json`, which the converter leaves beside the folder of the episodes; empty where it is not.
-
-    Raises:
-        DataError: not JSON of that kind.
-    """
+    """`conversion_meta.json`, which the converter leaves beside the folder of the episodes; empty where it is not."""
     folders = [path.parent, path.parent.parent] if path.parent.name == "data" else [path.parent]
     for folder in folders:
         meta = folder / "conversion_meta.json"

@@ -55,7 +55,6 @@ class ArrayStore(FrameStore):
             self.array = np.load(self.path, mmap_mode="r")
 
     def take(self, frames: np.ndarray) -> np.ndarray:
-        """Copy the pictures of some frames."""
         return np.take(np.asarray(self.array), frames, axis=0)  # (B, V, H, W, 3)
 
 
@@ -73,7 +72,6 @@ class FileStore(FrameStore):
         self._open: dict[int, None] = {}  # episodes, the one read last at the end
 
     def take(self, frames: np.ndarray) -> np.ndarray:
-        """Decode the pictures of some frames."""
         out = np.empty((len(frames), len(self.episodes[0].cameras), *self.image_size, 3), np.uint8)
         for row, frame in zip(out, frames, strict=True):
             index = int(np.searchsorted(self.ends, frame, side="right"))

@@ -85,11 +85,7 @@ def _task(episode: Episode) -> str:
 
 
 def _features(episodes: Sequence[Episode]) -> dict[str, dict[str, Any]]:
-    """What every row has, in lerobot's words.
-
-    Raises:
-        DataError: episodes with other cameras, sizes or dimensions than the first.
-    """
+    """What every row has, in lerobot's words."""
     first = episodes[0]
     for episode in episodes:
         expected, got = ((one.cameras, one.frames.image_sizes) for one in (first, episode))

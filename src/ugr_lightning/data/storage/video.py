@@ -71,15 +71,9 @@ class VideoFrames(FrameSource):
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """The file of each camera."""
         return tuple(view.path for view in self.views)
 
     def read(self, step: int, out: np.ndarray) -> None:
-        """Decode one step into `out`.
-
-        Raises:
-            DataError: a video that has no such frame, or is damaged.
-        """
         av = import_av()
         for index, (view, picture) in enumerate(zip(self.views, out, strict=True)):
             where = f"{view.path}[{step}]"
@@ -93,7 +87,6 @@ class VideoFrames(FrameSource):
             picture[:] = found
 
     def close(self) -> None:
-        """Close the videos; the next read opens them again."""
         if self._opened is not None and self._opened[0] == os.getpid():
             for decoder in self._opened[1]:
                 decoder.container.close()

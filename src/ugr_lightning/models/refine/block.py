@@ -23,14 +23,12 @@ class Block(Selector):
         self.length = length
 
     def budget(self, chunk_length: int) -> int:
-        """The length of the block."""
         if self.length > chunk_length:
             fix = "Shorten the block or lengthen the chunk."
             raise ConfigError("Block.length", f"at most the chunk length {chunk_length}", self.length, fix)
         return self.length
 
     def select(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
-        """See `Selector.select`."""
         batch, steps = valid.shape
         places = steps - self.budget(steps) + 1
         if training:

@@ -9,9 +9,7 @@ class Full(Selector):
     """Refines every step, m = 1."""
 
     def budget(self, chunk_length: int) -> int:
-        """All K."""
         return chunk_length
 
     def select(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
-        """See `Selector.select`."""
         return valid.clone()  # (B, K)

@@ -18,7 +18,6 @@ class Oracle(Ranked):
     offline = True
 
     def scores(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
-        """The true errors, (B, K)."""
         if log_variance is None:
             fix = "Use it as `ugr analyze --budgets` does, on recorded episodes."
             raise ConfigError("Oracle", "the true error of each step", "none: at run time nobody knows it", fix)

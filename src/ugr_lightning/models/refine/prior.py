@@ -35,7 +35,6 @@ class Prior(Ranked):
         return {**recorded, "init_args": {**recorded["init_args"], "file": None, "errors": list(self.errors)}}
 
     def budget(self, chunk_length: int) -> int:
-        """floor(rho K)."""
         if len(self.errors) != chunk_length:
             raise ConfigError("Prior", f"one error for each of {chunk_length} positions", len(self.errors), FIX)
         return super().budget(chunk_length)

@@ -32,7 +32,6 @@ class Ranked(Selector):
         """The score of each step, (B, K) or, where it does not depend on the sample, (K,); see `select`."""
 
     def budget(self, chunk_length: int) -> int:
-        """floor(rho K)."""
         budget = math.floor(self.ratio * chunk_length + 1e-9)  # 0.3 * 50 must be 15, whatever its rounding
         if budget < 1:
             where = f"{type(self).__name__}.ratio"
@@ -40,7 +39,6 @@ class Ranked(Selector):
         return budget
 
     def select(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
-        """See `Selector.select`."""
         scores = self.scores(log_variance, valid, training).expand(valid.shape)  # (B, K)
         ranking = scores.masked_fill(~valid, -torch.inf).argsort(dim=1, descending=True, stable=True)  # ties: lower k
         chosen = ranking[:, : self.budget(valid.shape[1])]  # (B, M)

@@ -18,7 +18,6 @@ class Uncertainty(Ranked):
     needs_uncertainty = True
 
     def scores(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
-        """The log-variance, (B, K)."""
         if log_variance is None:
             raise ConfigError("Uncertainty", "a log-variance per step", "none", "Build the uncertainty head.")
         return log_variance

@@ -187,12 +187,7 @@ class HangingMug(TwoArmEnv):
         return TcpPose(origin + GRASP * self.height * UP, gripper_down(yaw))
 
     def _hanging(self, along: float, below: float = 0.0) -> TcpPose:
-        """Right tool pose that holds the mug on its side with the peg's line through its handle.
-
-        Args:
-            along: metres from the peg's root.
-            below: metres that the middle of the opening is below the peg's line.
-        """
+        """Right tool pose that holds the mug on its side: `along` metres from the peg's root, `below` its line."""
         rotation = (
             rotation_z(self.rack[2]) @ rotation_y(np.pi / 2.0) @ rotation_z(np.pi)
         )  # handle up, bottom to the left

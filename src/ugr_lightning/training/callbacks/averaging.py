@@ -69,12 +69,10 @@ class WeightAverage(Callback):
             self._swap(pl_module)
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Validate the average."""
         self._swap(pl_module)
         self._validating = True
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Back to the training weights."""
         self._swap(pl_module)
         self._validating = False
 
@@ -104,11 +102,9 @@ class WeightAverage(Callback):
             pl_module.load_state_dict(checkpoint[_TRAINING_WEIGHTS])
 
     def state_dict(self) -> dict[str, Any]:
-        """The step of the last update."""
         return {"step": self._step}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore the step of the last update."""
         self._step = state_dict["step"]
 
     def _swap(self, pl_module: LightningModule) -> None:

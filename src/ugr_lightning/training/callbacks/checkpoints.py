@@ -45,7 +45,6 @@ class PolicyCheckpoints(Checkpoint):
                 remove_unfinished(folder, name)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Remember that fresh values are there."""
         self._validated = not trainer.sanity_checking
 
     def on_train_epoch_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -109,7 +108,6 @@ class PolicyCheckpoints(Checkpoint):
         return True
 
     def state_dict(self) -> dict[str, Any]:
-        """The best values so far, and of what."""
         return {"best": dict(self.best), "monitor": [self.mode, self.monitor]}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:

@@ -28,7 +28,6 @@ class ValidationFigures(Callback):
         self._sums: dict[str, Tensor] = {}
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Forget the last validation."""
         self._example, self._sums = None, {}
 
     def on_validation_batch_end(
@@ -61,35 +60,28 @@ class ValidationFigures(Callback):
         return bool(wanted) and trainer.is_global_zero and not trainer.sanity_checking
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Draw."""
         if self._due(trainer) and self._example is not None:
-            log_figure(trainer.loggers, "figures/chunk", chunk_figure(*self._example), trainer.global_step)
+            log_figure(trainer.loggers, "figures/chunk", _chunk_figure(*self._example), trainer.global_step)
             means = {name: (total / self._sums["count"].clamp(min=1)).cpu() for name, total in self._sums.items()}
-            log_figure(trainer.loggers, "figures/error_by_step", step_figure(means), trainer.global_step)
+            log_figure(trainer.loggers, "figures/error_by_step", _step_figure(means), trainer.global_step)
         if not trainer.sanity_checking:
             self._validations += 1
 
 
-def chunk_figure(batch: Batch, chunk: Chunk, sample: int = 0) -> Figure:
-    """Demonstrated, coarse and executed actions of one sample, one panel per dimension.
-
-    Args:
-        batch: demonstrated chunks.
-        chunk: predicted ones.
-        sample: index in the batch.
-    """
-    length = int(batch.valid[sample].sum())
+def _chunk_figure(batch: Batch, chunk: Chunk) -> Figure:
+    """Demonstrated, coarse and executed actions of the first sample, one panel per dimension."""
+    length = int(batch.valid[0].sum())
     action_dim = batch.actions.shape[-1]
     columns = (action_dim + 1) // 2
     figure = Figure(figsize=(2.2 * columns, 5), layout="constrained")
     axes = figure.subplots(2, columns, squeeze=False, sharex=True)
     for dim, axis in enumerate(axes.flat[:action_dim]):
-        axis.plot(batch.actions[sample, :length, dim].cpu(), color="black", label="demonstrated")
+        axis.plot(batch.actions[0, :length, dim].cpu(), color="black", label="demonstrated")
         if chunk.coarse is not None:
-            axis.plot(chunk.coarse[sample, :length, dim].float().cpu(), color="tab:blue", lw=1, label="coarse")
-        axis.plot(chunk.actions[sample, :length, dim].float().cpu(), color="tab:orange", lw=1, label="executed")
+            axis.plot(chunk.coarse[0, :length, dim].float().cpu(), color="tab:blue", lw=1, label="coarse")
+        axis.plot(chunk.actions[0, :length, dim].float().cpu(), color="tab:orange", lw=1, label="executed")
         if chunk.refined is not None:
-            for k in torch.nonzero(chunk.refined[sample, :length]).flatten().tolist():
+            for k in torch.nonzero(chunk.refined[0, :length]).flatten().tolist():
                 axis.axvspan(k - 0.5, k + 0.5, color="tab:orange", alpha=0.15, lw=0)
         low, high = axis.get_ylim()
         if high - low < SMALLEST_SPAN:  # an arm at rest shall look like one
@@ -97,18 +89,12 @@ def chunk_figure(batch: Batch, chunk: Chunk, sample: int = 0) -> Figure:
         axis.set_title(f"action {dim}", fontsize=8)
         axis.tick_params(labelsize=7)
     axes.flat[0].legend(fontsize=7)
-    figure.suptitle(
-        f"episode {int(batch.episode[sample])}, step {int(batch.step[sample])}; shaded: refined", fontsize=9
-    )
+    figure.suptitle(f"episode {int(batch.episode[0])}, step {int(batch.step[0])}; shaded: refined", fontsize=9)
     return figure
 
 
-def step_figure(means: dict[str, Tensor]) -> Figure:
-    """Error, predicted deviation and frequency of refinement over the steps of the chunk.
-
-    Args:
-        means: (K,) means over the validation: `error`, and where there are `coarse`, `deviation`, `refined`.
-    """
+def _step_figure(means: dict[str, Tensor]) -> Figure:
+    """Error, predicted deviation and frequency of refinement over the K steps, each (K,) a mean of the validation."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
     axis.plot(means["error"], color="tab:orange", label="error, executed")

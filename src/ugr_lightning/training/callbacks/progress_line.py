@@ -25,7 +25,6 @@ class TrainingProgress(ProgressBar):
         """Called on all processes but the first; the bar and its lines look at the rank themselves."""
 
     def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Open the bar."""
         total = int(trainer.estimated_stepping_batches)
         shown = trainer.is_global_zero and sys.stderr.isatty()
         self._bar = Progress("training", total, done=trainer.global_step, shown=shown)
@@ -56,7 +55,6 @@ class TrainingProgress(ProgressBar):
             self._restart_clock()
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Say where training is."""
         if self._bar is None or trainer.sanity_checking or not trainer.is_global_zero:
             return
         values = [f"{name} {trainer.callback_metrics[f'val/{name}']:.4f}" for name in _SAID]
@@ -66,7 +64,6 @@ class TrainingProgress(ProgressBar):
         self._bar.message(f"step {step}/{total}  val {'  '.join(values)}  {left / 60:.1f} min left")
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Close the bar."""
         self._close()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:

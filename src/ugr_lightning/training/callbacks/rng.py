@@ -24,7 +24,6 @@ class CounterSeeds(Callback):
         self.seed = int(os.environ.get("PL_GLOBAL_SEED", "0")) if seed is None else seed
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """Seed torch, NumPy and Python for this batch."""
         seed = counter_seed(self.seed, trainer.current_epoch, batch_idx, trainer.global_rank)
         torch.manual_seed(seed)
         np.random.seed(seed % 2**32)

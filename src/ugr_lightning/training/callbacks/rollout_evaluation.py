@@ -61,11 +61,9 @@ class RolloutEvaluation(Callback):
         self._simulators = Simulators()
 
     def on_exception(self, trainer: Trainer, pl_module: LightningModule, exception: BaseException) -> None:
-        """End the simulators."""
         self._simulators.close()
 
     def teardown(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
-        """End the simulators."""
         self._simulators.close()
 
     def on_fit_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
@@ -87,11 +85,7 @@ class RolloutEvaluation(Callback):
             self.every_n_steps = 0
 
     def _check_robot(self, policy: ChunkPolicy) -> None:
-        """A policy of another robot's demonstrations would only fail at the first rollout.
-
-        Raises:
-            ConfigError: the task's robot has other joints or cameras than the policy.
-        """
+        """A policy of another robot's demonstrations would only fail at the first rollout."""
         try:
             require_fit(policy, str(self.task))
         except CheckpointError as error:
@@ -134,7 +128,7 @@ class RolloutEvaluation(Callback):
         if video:
             log_image(trainer.loggers, "rollout/episode", video, step)
         if uncertainty:
-            log_figure(trainer.loggers, "rollout/uncertainty", uncertainty_figure(uncertainty), step)
+            log_figure(trainer.loggers, "rollout/uncertainty", _uncertainty_figure(uncertainty), step)
         print(f"step {step}  rollout on {len(results)} selection seeds: {summary}", flush=True)
 
     def _run(
@@ -173,12 +167,8 @@ class RolloutEvaluation(Callback):
         return results, uncertainty
 
 
-def uncertainty_figure(log_variance: list[np.ndarray]) -> Figure:
-    """The predicted uncertainty of every chunk of an episode, one column per chunk.
-
-    Args:
-        log_variance: s_k (K,) of each chunk, in the order in which they were predicted.
-    """
+def _uncertainty_figure(log_variance: list[np.ndarray]) -> Figure:
+    """The predicted uncertainty of every chunk of an episode, one column per chunk."""
     figure = Figure(figsize=(7, 4), layout="constrained")
     axis = figure.subplots()
     picture = axis.imshow(np.stack(log_variance, axis=1), aspect="auto", origin="lower", interpolation="nearest")

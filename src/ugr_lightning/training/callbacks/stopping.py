@@ -60,5 +60,4 @@ class OrderlyStop(Callback):
             exception.note = f"after step {trainer.global_step}; `--checkpoint last` goes on from there"
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Give the signals back."""
         self._handlers.close()
