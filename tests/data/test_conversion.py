@@ -69,6 +69,11 @@ def test_there_and_back_is_exact(name, recording, tmp_path):
         assert np.array_equal(one.state, other.state)
         assert np.array_equal(one.action, other.action)
         if name in ("act", "robotwin"):
+            assert (one.seed, one.extras["task"], one.extras["control_hz"]) == (
+                other.seed,
+                other.extras["task"],
+                other.extras["control_hz"],
+            )
             assert [one.frames.jpegs(t) for t in range(one.length)] == [
                 other.frames.jpegs(t) for t in range(one.length)
             ]

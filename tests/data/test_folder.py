@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from ugr_lightning.data.folder import (
-    episode_path,
     find_episodes,
     read_scene_info,
     read_seeds,
@@ -15,7 +14,6 @@ from ugr_lightning.data.folder import (
     write_seeds,
 )
 from ugr_lightning.errors import DataError
-from ugr_lightning.system.files import publish
 
 
 def _touch(folder, *names):
@@ -72,17 +70,3 @@ def test_damaged_lists_are_one_clear_error(tmp_path, name, content, read):
     (tmp_path / name).write_text(content)
     with pytest.raises(DataError, match=name):
         read(tmp_path)
-
-
-def test_publishing_is_all_or_nothing(tmp_path):
-    target = tmp_path / "a" / "list.txt"
-    publish(target, lambda path: path.write_text("first"))
-
-    def half(path):
-        path.write_text("sec")
-        raise OSError("no space left")
-
-    with pytest.raises(OSError, match="no space"):
-        publish(target, half)
-    assert target.read_text() == "first"
-    assert episode_path(tmp_path, 3).name == "episode3.hdf5"

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ugr_lightning.data.folder import episode_path, write_seeds
-from ugr_lightning.data.formats import find_format
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
 from ugr_lightning.data.inspection import column_names, inspect_demonstrations, measure_alignment
 from ugr_lightning.data.layout import Joint, Layout
@@ -236,13 +235,3 @@ def test_duplicates_gaps_and_leftovers_are_found(make):
     assert any("seeds used more than once: 0" in line for line in found)
     assert any("same states and actions: 1 is 0" in line for line in found)
     assert len(found) == 4
-
-
-def test_every_format_is_inspected_with_the_same_numbers(make, tmp_path):
-    episodes = [read_episode(episode_path(make(index), index)) for index in range(2)]
-    for name in ("act", "original-act"):
-        find_format(name).write(tmp_path / name, episodes)
-        found = inspect_demonstrations(tmp_path / name)
-        assert found.form.name == name
-        assert all(np.array_equal(a, e.state) for a, e in zip(found.rows("state"), episodes, strict=True))
-        assert found.seen[0].views["cam_high"].marked is None

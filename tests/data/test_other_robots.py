@@ -55,18 +55,6 @@ def test_other_robots_are_inspected_trained_on_and_converted(robot, tmp_path):
     assert all(np.array_equal(*both) for both in zip(back.rows("action"), found.rows("action"), strict=True))
 
 
-def test_a_layout_that_is_needed_is_the_advice_and_not_another_recording(tmp_path):
-    for number, (make, width) in enumerate(
-        ((lambda f: write_robotwin(f, joints=7), 16), (lambda f: write_act(f, width=8), 8))
-    ):
-        folder = make(tmp_path / str(number))
-        form = detect(folder)
-        with pytest.raises(DataError, match=f"--data.layout.state {width}") as caught:
-            form.read(form.find(folder)[0], form.peek(form.find(folder)[0]).cameras)
-        assert "ugr collect" not in str(caught.value)
-        assert "remove" not in str(caught.value)
-
-
 @pytest.mark.parametrize("write", [write_act, write_robotwin])
 def test_cameras_of_different_sizes_are_trained_on_at_one_size(write, tmp_path):
     wrist = "cam_left_wrist" if write is write_act else "left_camera"
