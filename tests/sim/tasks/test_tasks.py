@@ -1,5 +1,4 @@
 import importlib.abc
-import subprocess
 import sys
 
 import pytest
@@ -7,20 +6,6 @@ import pytest
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim.sapien_simulator import SapienSimulator
 from ugr_lightning.sim.tasks import environment_id, load_task, task_names, task_summaries, task_version
-
-
-def test_tasks_are_found_without_importing_the_simulator():
-    program = (
-        "import sys, ugr_lightning.sim.tasks as t, ugr_lightning.sim.seeds, ugr_lightning.sim.render;"
-        "import ugr_lightning.sim.sapien_simulator;"
-        "print(t.task_names(), sorted(t.task_summaries()));"
-        "print([m for m in ('sapien', 'mani_skill', 'gymnasium') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    names, loaded = done.stdout.splitlines()
-    assert "click_alarmclock" in names
-    assert "handover_block" in names
-    assert loaded == "[]"
 
 
 def test_every_task_has_a_summary_a_horizon_and_a_version():
