@@ -79,9 +79,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("wrong", WRONG)
-@pytest.mark.parametrize(
-    "part", ["blueprint", "cameras", "chunk_length", "state_dim", "action_dim", "data", "versions"]
-)
+@pytest.mark.parametrize("part", PARTS)
 def test_a_checkpoint_that_lacks_a_part_is_refused_by_name(tmp_path, checkpoint, part, wrong):
     content = torch.load(checkpoint, weights_only=True)
     WRONG[wrong](content["policy"], part)

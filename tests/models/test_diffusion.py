@@ -197,14 +197,6 @@ def test_with_state_dropout_of_one_the_state_changes_nothing(tiny_dp, batch):
     assert torch.equal(policy.predict(moved).actions, policy.predict(batch.observation).actions)
 
 
-def test_state_dropout_hides_whole_states_in_training_only(tiny_dp):
-    policy = tiny_dp(state_dropout=0.5)
-    hidden = (policy.train().disturb(torch.ones(400, 1, 14))[0] == 0).flatten(1)
-    assert torch.equal(hidden.all(1), hidden.any(1))
-    assert 0.4 < hidden[:, 0].float().mean() < 0.6
-    assert policy.eval().disturb(torch.ones(9, 1, 14))[0].all()
-
-
 @pytest.mark.parametrize("precision", ["fp32", "bf16"])
 @variants
 def test_the_policy_for_inference_predicts_the_same(tiny_dp, batch, changes, precision):

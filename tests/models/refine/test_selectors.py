@@ -51,12 +51,8 @@ def whole(batch: int = 6) -> torch.Tensor:
     return torch.ones(batch, STEPS, dtype=torch.bool)
 
 
-def test_the_selectors_of_the_paper_are_discovered():
-    assert {Full, Block, Uncertainty} <= set(discovered())
-
-
-def test_the_controls_are_discovered():
-    assert {Head, Tail, Scattered, Prior, Oracle} <= set(discovered())
+def test_the_selectors_of_the_paper_and_the_controls_are_discovered():
+    assert {Full, Block, Uncertainty, Head, Tail, Scattered, Prior, Oracle} <= set(discovered())
 
 
 @every_selector
