@@ -43,7 +43,7 @@ def outcome(results):
 
 @pytest.mark.parametrize("execution", ["aggregate", 3, "5"])
 def test_a_policy_is_judged_seed_by_seed(runner, execution):
-    results = runner(PolicyActor(Reacher(), checkpoint="abc"), SEEDS, execution=execution)
+    results = runner(PolicyActor(Reacher(), checkpoint="abc", refine_ratio=0.2), SEEDS, execution=execution)
     assert [result.seed for result in results] == SEEDS
     assert all(result.success and result.first_success_step == result.steps for result in results)
     first = results[0]
@@ -51,14 +51,9 @@ def test_a_policy_is_judged_seed_by_seed(runner, execution):
     assert first.seeds_hash == seeds_hash(SEEDS)
     assert first.log_variance == {"mean": -3.0, "max": -1.0}
     assert set(first.seconds) == {"query", "simulate"}
-    assert first.refine_ratio is None
+    assert first.refine_ratio == 0.2
     every = 1 if execution == "aggregate" else int(execution)
     assert first.queries == -(-first.steps // every)
-
-
-def test_results_carry_the_budget_that_was_chosen(runner):
-    (result,) = runner(PolicyActor(Reacher(), refine_ratio=0.2), [1])
-    assert result.refine_ratio == 0.2
 
 
 def test_the_dummies_run_through_the_same_runner(runner):
@@ -307,12 +302,6 @@ def test_a_policy_of_several_observations_sees_the_steps_just_before_also_those_
             assert pixels[0].tolist() == past
     assert next(seen, None) is None
     assert len(policy.histories) > 3
-
-
-def test_chunks_are_queried_only_when_used_up(runner):
-    policy = Reacher()
-    results = runner(policy, [0], execution=5)
-    assert len(policy.batch_sizes) - PROBES == -(-results[0].steps // 5)
 
 
 def test_nan_never_reaches_the_simulator_and_names_step_and_seed():

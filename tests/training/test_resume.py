@@ -43,13 +43,6 @@ def test_a_resumed_run_is_the_uninterrupted_one(tmp_path, limit):
     assert best[0] == best[1]
 
 
-def test_two_runs_with_the_same_seed_have_the_same_weights_bit_for_bit(tmp_path):
-    folders = [tmp_path / name / "version_0" for name in "ab"]
-    for folder in folders:
-        train(folder, max_epochs=2)
-    assert same(weights(folders[0]), weights(folders[1]))
-
-
 def test_a_killed_and_resumed_run_is_the_uninterrupted_one(tmp_path):
     straight, killed = tmp_path / "a" / "version_0", tmp_path / "b" / "version_0"
     steps = 300
