@@ -1,15 +1,10 @@
 """`ugr analyze`: whether a checkpoint's uncertainty knows the error."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from ugr_lightning.cli.parsing.call import Count, call
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr analyze`."""
-    return call(_analyze, command, argv, ["checkpoint"])
 
 
 def _analyze(
@@ -66,3 +61,6 @@ def _analyze(
     study.write(folder)
     print(f"numbers, tables and figures: {folder}")
     return 0
+
+
+run = partial(call, _analyze, leading=["checkpoint"])

@@ -1,6 +1,7 @@
 """`ugr bridge`: let a checkpoint be evaluated by other projects."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from ugr_lightning.cli.parsing.call import call_one_of
@@ -130,8 +131,4 @@ FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
     "xpolicylab": (_xpolicylab, ("checkpoint",)),
     "serve": (_serve, ("checkpoint",)),
 }
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr bridge NAME`."""
-    return call_one_of(FUNCTIONS, command, argv)
+run = partial(call_one_of, FUNCTIONS)

@@ -1,6 +1,6 @@
 """`ugr collect`: demonstrations of the scripted experts; `ugr fit` records through it what a training lacks."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,11 +9,6 @@ from ugr_lightning.demos.noise import Noise
 
 if TYPE_CHECKING:
     from ugr_lightning.data.datamodule import ChunkDataModule
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr collect`."""
-    return call(_collect, command, argv, ["task"])
 
 
 def _collect(
@@ -57,6 +52,9 @@ def _collect(
         )
         print(f"{episodes} demonstrations in {folder}", flush=True)
     return 0
+
+
+run = partial(call, _collect, leading=["task"])
 
 
 def record_demonstrations(data: "ChunkDataModule") -> None:

@@ -1,7 +1,8 @@
 """`ugr data inspect` and `ugr data convert`: demonstrations of any format that is recognised."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -259,8 +260,4 @@ FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {
     "inspect": (inspect_data, ("path",)),
     "convert": (convert_data, ("source", "target")),
 }
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr data inspect` or `ugr data convert`."""
-    return call_one_of(FUNCTIONS, command, argv)
+run = partial(call_one_of, FUNCTIONS)

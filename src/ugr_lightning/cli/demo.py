@@ -1,16 +1,11 @@
 """`ugr demo`: record, train, evaluate, and one table at the end."""
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr demo`."""
-    from ugr_lightning.cli.parsing.call import call
-
-    return call(_demo, command, argv)
+from ugr_lightning.cli.parsing.call import call
 
 
 def _demo(
@@ -57,3 +52,6 @@ def _demo(
     print(f"{(time.monotonic() - began) / 60:.1f} minutes; checkpoint {checkpoint}, episode {folder / 'episode.gif'}")
     print(f"Watch the training:  tensorboard --logdir {root}")
     return 0
+
+
+run = partial(call, _demo)

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple, TextIO
 
@@ -53,14 +54,12 @@ class Finding(NamedTuple):
     advice: str = ""
 
 
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr doctor`."""
-    return call(_doctor, command, argv)
-
-
 def _doctor() -> int:
     """Check this machine and say what to do."""
     return run_doctor(sys.stdout)
+
+
+run = partial(call, _doctor)
 
 
 def run_doctor(out: TextIO) -> int:

@@ -1,6 +1,6 @@
 """`ugr export`: a checkpoint for other programs."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -42,6 +42,4 @@ def _export(
     return 0
 
 
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr export`."""
-    return call(_export, command, argv, ["checkpoint"])
+run = partial(call, _export, leading=["checkpoint"])

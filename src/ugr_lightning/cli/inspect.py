@@ -1,20 +1,14 @@
 """`ugr inspect`: what a checkpoint, an episode or a folder is."""
 
 import json
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import DataError
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr inspect`."""
-    from ugr_lightning.cli.parsing.call import call
-
-    return call(_inspect, command, argv, ["path"])
 
 
 def _inspect(path: str, picture: str | None = None) -> int:
@@ -40,6 +34,9 @@ def _inspect(path: str, picture: str | None = None) -> int:
         raise DataError(place, "a checkpoint, an episode or a folder", "nothing there", "Check the path.")
     print("\n".join(lines))
     return 0
+
+
+run = partial(call, _inspect, leading=["path"])
 
 
 def _checkpoint(path: Path) -> list[str]:

@@ -10,31 +10,28 @@ from ugr_lightning.errors import UGRError
 from ugr_lightning.system.signals import Stopped, stoppable
 
 COMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("ugr_lightning.cli.demo:run", "the whole loop in minutes: record, train, evaluate, show a table"),
-    "doctor": ("ugr_lightning.cli.doctor:run", "check this machine and say what to do"),
-    "tasks": ("ugr_lightning.cli.tasks:run", "list the simulated tasks; measure, verify and picture them"),
-    "collect": ("ugr_lightning.cli.collect:run", "record demonstrations of a task's scripted expert"),
-    "fit": ("ugr_lightning.cli.fit:run", "train a policy; records missing demonstrations first"),
-    "validate": ("ugr_lightning.cli.fit:run", "validation losses and errors of a checkpoint"),
-    "test": ("ugr_lightning.cli.rollout:run", "success of a checkpoint on the evaluation seeds, both execution modes"),
-    "rollout": ("ugr_lightning.cli.rollout:run", "let a checkpoint, or zero, random or expert, act in a task"),
-    "predict": ("ugr_lightning.cli.predict:run", "a checkpoint's commands beside those of demonstrations, by joint"),
-    "analyze": ("ugr_lightning.cli.analyze:run", "whether a checkpoint's uncertainty knows the error"),
-    "sweep": ("ugr_lightning.cli.sweep:run", "one checkpoint with many budgets and executions, in closed loop"),
-    "benchmark": (
-        "ugr_lightning.cli.benchmark.command:run",
-        "policies, tasks and training seeds of one yaml: record, train, evaluate",
-    ),
-    "report": ("ugr_lightning.cli.report:run", "compare policies: intervals, paired tests, what may be concluded"),
-    "replay": ("ugr_lightning.cli.replay:run", "execute recorded commands again and confirm the outcome"),
-    "inspect": ("ugr_lightning.cli.inspect:run", "say what a checkpoint, an episode or a folder is"),
-    "view": ("ugr_lightning.cli.view:run", "a demonstration, predictions or a rollout as a timeline, in rerun"),
-    "data": ("ugr_lightning.cli.data:run", "say what demonstrations of any format are; convert them"),
-    "bridge": ("ugr_lightning.cli.bridge:run", "let RoboTwin or XPolicyLab evaluate a checkpoint"),
-    "import-act": ("ugr_lightning.cli.import_checkpoint:run", "make a checkpoint of one of the original ACT code's"),
-    "import-lerobot": ("ugr_lightning.cli.import_checkpoint:run", "make a checkpoint of one of lerobot's ACT policies"),
-    "export": ("ugr_lightning.cli.export:run", "write a checkpoint for other programs: act, safetensors, onnx, ..."),
-    "speed": ("ugr_lightning.cli.speed:run", "measure speed on this machine"),
+    "demo": ("demo", "the whole loop in minutes: record, train, evaluate, show a table"),
+    "doctor": ("doctor", "check this machine and say what to do"),
+    "tasks": ("tasks", "list the simulated tasks; measure, verify and picture them"),
+    "collect": ("collect", "record demonstrations of a task's scripted expert"),
+    "fit": ("fit", "train a policy; records missing demonstrations first"),
+    "validate": ("fit", "validation losses and errors of a checkpoint"),
+    "test": ("rollout", "success of a checkpoint on the evaluation seeds, both execution modes"),
+    "rollout": ("rollout", "let a checkpoint, or zero, random or expert, act in a task"),
+    "predict": ("predict", "a checkpoint's commands beside those of demonstrations, by joint"),
+    "analyze": ("analyze", "whether a checkpoint's uncertainty knows the error"),
+    "sweep": ("sweep", "one checkpoint with many budgets and executions, in closed loop"),
+    "benchmark": ("benchmark.command", "policies, tasks and training seeds of one yaml: record, train, evaluate"),
+    "report": ("report", "compare policies: intervals, paired tests, what may be concluded"),
+    "replay": ("replay", "execute recorded commands again and confirm the outcome"),
+    "inspect": ("inspect", "say what a checkpoint, an episode or a folder is"),
+    "view": ("view", "a demonstration, predictions or a rollout as a timeline, in rerun"),
+    "data": ("data", "say what demonstrations of any format are; convert them"),
+    "bridge": ("bridge", "let RoboTwin or XPolicyLab evaluate a checkpoint"),
+    "import-act": ("import_checkpoint", "make a checkpoint of one of the original ACT code's"),
+    "import-lerobot": ("import_checkpoint", "make a checkpoint of one of lerobot's ACT policies"),
+    "export": ("export", "write a checkpoint for other programs: act, safetensors, onnx, ..."),
+    "speed": ("speed", "measure speed on this machine"),
 }
 
 RENAMED = {"bench": "speed"}
@@ -101,8 +98,8 @@ def _run(command: str, arguments: list[str]) -> int:
         near = RENAMED.get(command) or next(iter(difflib.get_close_matches(command, COMMANDS, n=1)), None)
         fix = f"Did you mean `ugr {near}`?" if near else "`ugr` alone lists the commands."
         raise ConfigError("ugr", "a command", command, fix)
-    module, _, name = COMMANDS[command][0].partition(":")
-    return int(getattr(importlib.import_module(module), name)(command, arguments) or 0)
+    module = importlib.import_module(f"ugr_lightning.cli.{COMMANDS[command][0]}")
+    return int(module.run(command, arguments))
 
 
 if __name__ == "__main__":

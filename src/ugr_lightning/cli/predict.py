@@ -1,15 +1,10 @@
 """`ugr predict`: what a checkpoint would have commanded along demonstrations."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ugr_lightning.cli.parsing.call import Count, CountOrZero, call
 from ugr_lightning.errors import ConfigError
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr predict`."""
-    return call(_predict, command, argv, ["checkpoint"])
 
 
 def _predict(
@@ -74,3 +69,6 @@ def _predict(
     write_page(folder, "predictions", f"Predictions of {file}", [says], [table], figures, content)
     print(f"numbers and pictures: {folder}")
     return 0
+
+
+run = partial(call, _predict, leading=["checkpoint"])

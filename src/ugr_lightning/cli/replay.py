@@ -1,16 +1,10 @@
 """`ugr replay`: execute recorded commands again."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import DataError
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr replay`."""
-    from ugr_lightning.cli.parsing.call import call
-
-    return call(_replay, command, argv, ["path"])
 
 
 def _replay(path: str, workers: int = 2) -> int:
@@ -37,3 +31,6 @@ def _replay(path: str, workers: int = 2) -> int:
     print(f"{n - len(failed)} of {n} reproduced their success, {identical} of {n} with the same joints bit for bit")
     print(f"largest deviation of a joint: {largest:.3g} rad")
     return 2 if failed else 0
+
+
+run = partial(call, _replay, leading=["path"])

@@ -1,16 +1,10 @@
 """`ugr report`: results to Markdown, CSV and one HTML page, and how many episodes a comparison needs."""
 
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
+from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import ConfigError
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr report`."""
-    from ugr_lightning.cli.parsing.call import call
-
-    return call(_report, command, argv, ["paths"])
 
 
 def _report(
@@ -60,6 +54,9 @@ def _report(
         write_summary(evaluations, Path(out) / SUMMARY_FILE)
         print(*written, Path(out) / SUMMARY_FILE, sep="\n")
     return 0
+
+
+run = partial(call, _report, leading=["paths"])
 
 
 def _plan(power: list[float], discordance: float | None) -> int:

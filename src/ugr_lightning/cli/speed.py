@@ -1,16 +1,11 @@
 """`ugr speed`: what this machine reaches."""
 
 import sys
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
 from ugr_lightning.cli.parsing.call import call
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr speed`."""
-    return call(_speed, command, argv, ["parts"])
 
 
 def _speed(
@@ -42,3 +37,6 @@ def _speed(
         rounds=rounds,
         json_path=None if json is None else Path(json),
     )
+
+
+run = partial(call, _speed, leading=["parts"])

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -16,11 +17,6 @@ if TYPE_CHECKING:
 
 VARIANCE: Literal["aggregate-variance"] = "aggregate-variance"
 ADAPTIVE: Literal["adaptive"] = "adaptive"
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr sweep`."""
-    return call(_sweep, command, argv, ["checkpoint"])
 
 
 def _sweep(
@@ -67,6 +63,9 @@ def _sweep(
         budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers, device)
         _report(plan, budgets, modes, errors, folder)
     return 0
+
+
+run = partial(call, _sweep, leading=["checkpoint"])
 
 
 class SweepPlan(NamedTuple):

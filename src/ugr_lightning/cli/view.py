@@ -3,17 +3,12 @@
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from ugr_lightning.cli.parsing.call import Count, call
 from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.training.runs import resolve_checkpoint
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr view`."""
-    return call(_view, command, argv, ["path"])
 
 
 def _view(
@@ -51,6 +46,9 @@ def _view(
         timeline = Path(folder) / f"{place.stem}.rrd"
         _write(place, episode, file, stride, timeline)
         return subprocess.call([sys.executable, "-m", "rerun", str(timeline)])
+
+
+run = partial(call, _view, leading=["path"])
 
 
 def _write(place: Path, episode: int | None, checkpoint: Path | None, stride: int, out: Path) -> None:

@@ -4,6 +4,7 @@ import hashlib
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -11,6 +12,7 @@ import yaml
 
 from ugr_lightning.cli.benchmark.grid import Grid, Job, fingerprint, flat, read_grid, resolved_config
 from ugr_lightning.cli.benchmark.subprocesses import Failure, run_and_watch
+from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import ConfigError, UGRError
 from ugr_lightning.results.evaluations import RESULTS_FILE, RUN_FILE, RunInfo
 from ugr_lightning.results.results import drop_cut_off_line, read_results
@@ -20,13 +22,6 @@ from ugr_lightning.system.progress import clock
 from ugr_lightning.training.runs import resolve_checkpoint, versions_of
 
 PROGRAM = (sys.executable, "-m", "ugr_lightning.cli.main")
-
-
-def run(command: str, argv: Sequence[str]) -> int:
-    """Run `ugr benchmark`."""
-    from ugr_lightning.cli.parsing.call import call
-
-    return call(_benchmark, command, argv, ["grid"])
 
 
 def _benchmark(
@@ -66,6 +61,9 @@ def _benchmark(
         if job is None:
             _copy(Path(grid), folder / "results" / "grid.yaml")
         return Benchmark(plan, folder, chosen, configs, lock).run()
+
+
+run = partial(call, _benchmark, leading=["grid"])
 
 
 class State(NamedTuple):
