@@ -1,6 +1,6 @@
 import pytest
 import torch
-from published_act import OriginalACT, seen, small
+from published_act import SMALL, seen, small
 
 from ugr_lightning.bridges.act_checkpoint import DEAD, ORIGINAL, export_act, import_act
 from ugr_lightning.bridges.act_layout import sizes_of, translate
@@ -8,6 +8,7 @@ from ugr_lightning.bridges.act_statistics import ActStatistics
 from ugr_lightning.contract import Observation
 from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.act import ACT
+from ugr_lightning.speed.reference_act import ReferenceACT
 
 TWO = ("top", "wrist")
 
@@ -15,7 +16,7 @@ TWO = ("top", "wrist")
 @pytest.fixture
 def original():
     """Seven decoder layers, of which the first is read."""
-    return small(OriginalACT, decoder_layers=7)
+    return small(ReferenceACT, decoder_layers=7)
 
 
 @pytest.fixture
@@ -40,18 +41,19 @@ def weights(original):
     return {f"model.{name}": value for name, value in original.state_dict().items()}
 
 
-def executed(original, statistics, images, state):
+def executed(original, statistics, images, state, latent=None):
     """What the original code sends to the robot."""
     with torch.no_grad():
-        actions = original(images / 255, (state - statistics.qpos_mean) / statistics.qpos_std)
+        actions = original(images / 255, (state - statistics.qpos_mean) / statistics.qpos_std, latent)
     return actions * statistics.action_std + statistics.action_mean
 
 
-@pytest.mark.parametrize("prefix", ["model.", ""])
-def test_an_imported_policy_commands_what_the_original_commands(original, statistics, images, state, prefix):
+@pytest.mark.parametrize(("prefix", "latent"), [("model.", None), ("", torch.tensor([[1.0, -2, 0], [0, 1, 2]]))])
+def test_an_imported_policy_commands_what_the_original_commands(original, statistics, images, state, prefix, latent):
     weights = {prefix + name: value for name, value in original.state_dict().items()}
     policy, _ = import_act(weights, statistics, cameras=TWO, heads=4)
-    ours, theirs = policy.predict(Observation(images, state)).actions, executed(original, statistics, images, state)
+    ours = policy.predict(Observation(images, state), latent).actions
+    theirs = executed(original, statistics, images, state, latent)
     assert theirs.std(dim=(0, 1)).min() > 1e-3, "the comparison is of numbers that differ"
     torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
 
@@ -60,7 +62,7 @@ def test_the_posterior_is_imported_too(original, weights, statistics, state):
     policy, _ = import_act(weights, statistics, cameras=TWO, heads=4)
     actions, valid = torch.randn(2, 6, 4), torch.arange(6).expand(2, 6) < torch.tensor([[6], [3]])
     with torch.no_grad():
-        ours, theirs = policy.posterior(state, actions, valid), original.encode(state, actions, ~valid)
+        ours, theirs = policy.posterior(state, actions, valid), original.encode(state, actions, valid)
     torch.testing.assert_close(ours, theirs, atol=1e-5, rtol=0)
 
 
@@ -89,7 +91,7 @@ def test_what_goes_in_comes_out_bit_for_bit(weights, statistics):
 def test_the_network_of_the_paper_is_imported_whole():
     """At the paper's size, where only names and shapes are compared: nothing of that size is computed."""
     with torch.device("meta"):
-        paper = OriginalACT()
+        paper = ReferenceACT()
         ours = ACT(decoder_readout="first").state_dict()
     assert sum(parameter.numel() for parameter in paper.parameters()) == 83_897_487
     found = translate({f"model.{n}": v for n, v in paper.state_dict().items()}, ORIGINAL, "paper", DEAD)
@@ -119,7 +121,7 @@ def test_a_policy_of_ours_drives_the_original_code(images, state):
     policy = trained(decoder_readout="first")
     back = export_act(policy)
     assert any("copies of the first" in note for note in back.notes)
-    code = OriginalACT(dim=32, heads=4, feedforward=48, layers=2, steps=6, state=5, action=4, latent=3)
+    code = ReferenceACT(**SMALL)
     code.load_state_dict({name.removeprefix("model."): value for name, value in back.weights.items()})
     theirs = executed(code.eval(), back.statistics, images, state)
     torch.testing.assert_close(policy.predict(Observation(images, state)).actions, theirs, atol=1e-5, rtol=0)

@@ -3,18 +3,19 @@ from pathlib import Path
 
 import pytest
 import torch
-from published_act import OriginalACT, seen, small
+from published_act import seen, small
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import Observation
 from ugr_lightning.models.checkpoint import load_policy
+from ugr_lightning.speed.reference_act import ReferenceACT
 
 
 @pytest.fixture
 def original(tmp_path, monkeypatch):
     """A folder as the original training leaves it."""
     monkeypatch.chdir(tmp_path)
-    network = small(OriginalACT, decoder_layers=7)
+    network = small(ReferenceACT, decoder_layers=7)
     torch.save({f"model.{name}": value for name, value in network.state_dict().items()}, "policy_best.ckpt")
     numbers = {"qpos_mean": torch.ones(5).numpy(), "qpos_std": torch.full((5,), 0.5).numpy()}
     numbers |= {"action_mean": torch.arange(4.0).numpy(), "action_std": torch.full((4,), 2.0).numpy()}

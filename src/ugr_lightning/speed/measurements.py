@@ -274,7 +274,7 @@ def _networks(size: Size) -> tuple[ACT, ReferenceACT]:
     policy = ACT(decoder_readout="first", reconstruction="l1", **size.act)  # type: ignore[arg-type]
     policy.backbone.pretrained.fill_(True)  # random weights are as fast as trained ones
     policy.set_statistics(_statistics())
-    return policy, ReferenceACT(policy)
+    return policy, ReferenceACT(**size.act)
 
 
 def _statistics() -> Statistics:
