@@ -1,10 +1,10 @@
-import io
 import re
 
 import pytest
 
 from ugr_lightning.cli import doctor
-from ugr_lightning.cli.doctor import Finding, print_findings, run_doctor
+from ugr_lightning.cli.doctor import Finding
+from ugr_lightning.cli.main import main
 from ugr_lightning.sim.render import RenderProbe
 
 
@@ -14,43 +14,29 @@ def no_renderer(monkeypatch):
     monkeypatch.setattr(doctor, "probe_rendering", lambda: RenderProbe(False, "", "Install a driver."))
 
 
-def test_a_missing_renderer_fails_with_advice_and_training_is_said_to_work(no_renderer):
-    out = io.StringIO()
-    assert run_doctor(out) == 1
-    assert re.search(r"^fail +Vulkan device .*-> Install a driver\.$", out.getvalue(), re.MULTILINE)
-    assert "Training works" in out.getvalue()
+def test_a_missing_renderer_fails_with_advice_and_training_is_said_to_work(no_renderer, capsys):
+    assert main(["doctor"]) == 1
+    said = capsys.readouterr().out
+    assert re.search(r"^fail +Vulkan device .*-> Install a driver\.$", said, re.MULTILINE)
+    assert "Training works" in said
 
 
-def test_everything_that_the_package_needs_has_a_line(no_renderer):
-    out = io.StringIO()
-    run_doctor(out)
+def test_everything_that_the_package_needs_has_a_plain_line(no_renderer, capsys):
+    main(["doctor"])
+    said = capsys.readouterr().out
     for what in ("Python", "PyTorch", "precision", "Lightning", "SAPIEN", "ManiSkill", "Vulkan", "disk", "memory"):
-        assert re.search(rf"^(ok|warn|fail) +{what}", out.getvalue(), re.MULTILINE), what
+        assert re.search(rf"^(ok|warn|fail) +{what}", said, re.MULTILINE), what
+    *lines, last = said.splitlines()
+    assert "\x1b" not in said
+    assert all(re.match(r"(ok|warn|fail)  ", line) for line in lines)
+    assert last.startswith(f"{len(lines)} checks: ")
 
 
-def test_piped_output_is_plain_lines_of_one_finding_each(no_renderer):
-    out = io.StringIO()
-    run_doctor(out)
-    lines = out.getvalue().splitlines()
-    assert "\x1b" not in out.getvalue()
-    assert all(re.match(r"(ok|warn|fail)  ", line) for line in lines[:-1])
-    assert lines[-1].startswith(f"{len(lines) - 1} checks: ")
-
-
-def test_a_warning_alone_does_not_fail(monkeypatch):
-    monkeypatch.setattr(doctor, "CHECKS", (lambda: iter([Finding("warn", "disk", "little", "free some")]),))
-    assert run_doctor(io.StringIO()) == 0
-
-
-def test_a_terminal_gets_a_table():
-    class Terminal(io.StringIO):
-        def isatty(self) -> bool:
-            return True
-
-    out = Terminal()
-    print_findings([Finding("ok", "disk", "much")], out)
-    assert "━" in out.getvalue() or "─" in out.getvalue()
-    assert "1 checks: 0 failed, 0 with a warning" in out.getvalue()
+def test_a_warning_alone_does_not_fail_and_brackets_are_no_markup(monkeypatch, capsys):
+    monkeypatch.setattr(doctor, "CHECKS", (lambda: iter([Finding("warn", "disk", "little [bold]", "free some")]),))
+    assert main(["doctor"]) == 0
+    said = ["warn  disk  little [bold]  -> free some", "1 checks: 0 failed, 1 with a warning"]
+    assert capsys.readouterr().out.splitlines() == said
 
 
 @pytest.mark.parametrize(("fast", "status", "picked"), [(True, "ok", "bf16"), (False, "warn", "fp32")])

@@ -8,14 +8,14 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple, TextIO
+from typing import Literal, NamedTuple
 
 import torch
 from rich.console import Console
-from rich.table import Table
+from rich.markup import escape
 
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import simulator_advice
@@ -56,45 +56,19 @@ class Finding(NamedTuple):
 
 def _doctor() -> int:
     """Check this machine and say what to do."""
-    return run_doctor(sys.stdout)
+    console = Console(highlight=False, emoji=False, soft_wrap=True)
+    with console.status("looking at this machine"):  # draws nothing where there is no terminal
+        findings = [finding for check in CHECKS for finding in check()]
+    width = max(len(finding.what) for finding in findings)
+    for status, what, found, advice in findings:
+        words = escape(f"{found}  -> {advice}" if advice else found)
+        console.print(f"[{COLOURS[status]}]{status:<4}[/]  {what:<{width}}  {words}")
+    failed, warned = (sum(finding.status == status for finding in findings) for status in ("fail", "warn"))
+    console.print(f"{len(findings)} checks: {failed} failed, {warned} with a warning")
+    return int(failed > 0)
 
 
 run = partial(call, _doctor)
-
-
-def run_doctor(out: TextIO) -> int:
-    """Examine the machine and print one line for everything the package needs.
-
-    Args:
-        out: where to print: a coloured table on a terminal, plain lines otherwise.
-
-    Returns:
-        Exit code: 1 when something failed, else 0.
-    """
-    findings: list[Finding] = []
-    with Console(file=out).status("looking at this machine"):  # draws nothing where `out` is no terminal
-        for check in CHECKS:
-            findings.extend(check())
-    print_findings(findings, out)
-    return int(any(finding.status == "fail" for finding in findings))
-
-
-def print_findings(findings: list[Finding], out: TextIO) -> None:
-    """Print findings as a table on a terminal, and as `status  what  found  -> advice` lines otherwise."""
-    failed, warned = (sum(finding.status == status for finding in findings) for status in ("fail", "warn"))
-    closing = f"{len(findings)} checks: {failed} failed, {warned} with a warning"
-    if not out.isatty():
-        width = max(len(finding.what) for finding in findings)
-        for status, what, found, advice in findings:
-            print(f"{status:<4}  {what:<{width}}  {found}" + (f"  -> {advice}" if advice else ""), file=out)
-        print(closing, file=out)
-        return
-    table = Table("", "what", "found", "what to do", title="ugr doctor")
-    for status, what, found, advice in findings:
-        table.add_row(f"[{COLOURS[status]}]{status}[/]", what, found, advice)
-    console = Console(file=out)
-    console.print(table)
-    console.print(closing, highlight=False)
 
 
 def check_python() -> Iterator[Finding]:

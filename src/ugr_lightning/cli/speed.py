@@ -1,19 +1,19 @@
 """`ugr speed`: what this machine reaches."""
 
-import sys
+import json as to_json
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from ugr_lightning.cli.parsing.call import call
+from ugr_lightning.cli.parsing.call import Count, call
 
 
 def _speed(
     parts: list[Literal["training", "compact", "query", "data", "simulation"]] | None = None,
     quick: bool = False,
-    threads: int | None = None,
-    processes: int = 2,
-    rounds: int | None = None,
+    threads: Count | None = None,
+    processes: Count = 2,
+    rounds: Count | None = None,
     json: str | None = None,
 ) -> int:
     """Measure speed on this machine.
@@ -26,17 +26,29 @@ def _speed(
         rounds: times that each workload is timed; null for the default.
         json: file for the numbers.
     """
-    from ugr_lightning.speed.table import PARTS, measure_speed
+    import torch
 
-    return measure_speed(
-        sys.stdout,
-        parts=parts or PARTS,
-        quick=quick,
-        threads=threads,
-        processes=processes,
-        rounds=rounds,
-        json_path=None if json is None else Path(json),
-    )
+    from ugr_lightning.sim.render import require_rendering
+    from ugr_lightning.speed.table import HEAD, PARTS, cells_of, describe_machine, measure, print_cells
+    from ugr_lightning.system.files import publish_text
+    from ugr_lightning.system.limits import usable_cores
+
+    chosen = parts or PARTS
+    if "simulation" in chosen:
+        require_rendering()  # now, and not after minutes of measuring
+    torch.set_num_threads(threads or usable_cores())
+    machine = describe_machine()
+    print(", ".join(f"{key} {value}" for key, value in machine.items()))
+    print_cells(HEAD)
+    measurements = []
+    for found in measure(chosen, quick=quick, rounds=rounds, processes=processes):
+        print_cells(cells_of(found))
+        measurements.append(found._asdict())
+    if json is not None:
+        content = {"machine": machine, "quick": quick, "measurements": measurements}
+        publish_text(Path(json), to_json.dumps(content, indent=2) + "\n")
+        print(f"written to {json}")
+    return 0
 
 
 run = partial(call, _speed, leading=["parts"])
