@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from ugr_lightning.cli.parsing.call import Count, call
+from ugr_lightning.errors import ConfigError
 
 
 def _analyze(
@@ -36,7 +37,9 @@ def _analyze(
             before episodes failed.
         out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
     """
+    from ugr_lightning.models.act import ACT
     from ugr_lightning.models.checkpoint import load_policy
+    from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.training.runs import resolve_checkpoint
     from ugr_lightning.uncertainty import study as kit
     from ugr_lightning.uncertainty.predictions import open_data
@@ -44,9 +47,9 @@ def _analyze(
     file = resolve_checkpoint(checkpoint, run, root)
     policy, info = load_policy(file)
     if budgets:
-        kit.require_budgets(policy)
-    if estimators:
-        kit.require_estimators(policy)
+        with_refine_ratio(policy, 1.0)  # an error where the policy ranks no steps
+    if estimators and not isinstance(policy, ACT):
+        raise ConfigError("--estimators", "a policy of the class ACT", type(policy).__name__, "Leave it out.")
     opened = open_data(policy, info.trained_on, data, after_end)
     described = {"file": str(file), "sha256": info.sha256, "task": opened.task}
     study = kit.begin_study(policy, opened, described, stride=stride, resamples=resamples)

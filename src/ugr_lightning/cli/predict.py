@@ -34,9 +34,9 @@ def _predict(
         out: folder for the page, its numbers and pictures; null means `predictions-<checkpoint>` beside the checkpoint.
     """
     from ugr_lightning.models.checkpoint import load_policy
+    from ugr_lightning.results.tables import as_text
     from ugr_lightning.training.runs import resolve_checkpoint
     from ugr_lightning.uncertainty import open_loop as kit
-    from ugr_lightning.uncertainty.calibration_report import as_text
     from ugr_lightning.uncertainty.predictions import STD_FLOOR, open_data
     from ugr_lightning.uncertainty.study import write_page
 

@@ -169,8 +169,8 @@ def _closed_loop(
 
 def _report(plan: SweepPlan, budgets: Episodes, modes: Episodes, errors: list[Any] | None, folder: Path) -> None:
     """Print and write what was found."""
+    from ugr_lightning.results.tables import as_text
     from ugr_lightning.uncertainty import closed_loop as kit
-    from ugr_lightning.uncertainty.calibration_report import as_text
     from ugr_lightning.uncertainty.study import write_page
 
     tables, figures, sentences = [], {}, []

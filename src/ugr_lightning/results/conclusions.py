@@ -14,7 +14,6 @@ MARGIN = 0.10
 ENOUGH_TRAINING_SEEDS = 3
 FEW = 3
 """Up to so many comparisons that show nothing get a sentence each; more of them share one."""
-MAY, MAY_NOT = "What may be concluded:", "What may not:"
 
 
 @dataclass(frozen=True)
@@ -30,12 +29,9 @@ class Conclusion:
     may_not: list[str]
 
     def __str__(self) -> str:
-        return "\n\n".join(f"**{title}**\n\n" + "\n".join(f"- {text}" for text in items) for title, items in self.parts)
-
-    @property
-    def parts(self) -> list[tuple[str, list[str]]]:
-        """Both parts under their titles, without one that is empty."""
-        return [(title, items) for title, items in ((MAY, self.may), (MAY_NOT, self.may_not)) if items]
+        parts = {"What may be concluded:": self.may, "What may not:": self.may_not}
+        lists = {title: "\n".join(f"- {text}" for text in items) for title, items in parts.items() if items}
+        return "\n\n".join(f"**{title}**\n\n{items}" for title, items in lists.items())
 
 
 def conclude(report: Report) -> Conclusion:

@@ -1,7 +1,6 @@
 """Tests and intervals over several comparisons at once: Holm, sign flips, hierarchical bootstrap."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
@@ -51,24 +50,9 @@ def sign_flip_test(differences: Sequence[int]) -> float:
     return min(1.0, float(chance[sums >= observed].sum()))
 
 
-class BootstrapInterval(NamedTuple):
-    """A difference of success rates over training seeds and evaluation seeds.
-
-    Args:
-        difference: mean rate of a minus mean rate of b, tasks weighing the same.
-        low, high: 95 % percentile interval.
-        training_seeds: the smaller number of training seeds of the two policies, over all tasks.
-    """
-
-    difference: float
-    low: float
-    high: float
-    training_seeds: int
-
-
 def hierarchical_bootstrap(
     a: Sequence[np.ndarray], b: Sequence[np.ndarray], *, resamples: int = 10_000, seed: int = 0
-) -> BootstrapInterval:
+) -> tuple[float, float]:
     """Interval of a difference of success rates, for other training seeds and other evaluation seeds.
 
     Draws training seeds of either policy, and evaluation seeds common to both, with replacement. Tasks stay as they
@@ -79,6 +63,9 @@ def hierarchical_bootstrap(
         b: the same of the other; its columns are the same evaluation seeds.
         resamples: how often to draw.
         seed: of the draws.
+
+    Returns:
+        Limits of the 95 % percentile interval of the mean rate of a minus that of b, tasks weighing the same.
 
     Raises:
         ValueError: the tasks or the evaluation seeds of a and b do not match.
@@ -99,8 +86,7 @@ def hierarchical_bootstrap(
             rows = _weights(rng, resamples, outcomes.shape[0])  # (resamples, training seeds)
             drawn += sign * np.einsum("ir,rn,in->i", rows, outcomes.astype(float), columns, optimize=True) / len(a)
     low, high = np.quantile(drawn, [0.025, 0.975])
-    difference = float(np.mean([x.mean() - y.mean() for x, y in zip(a, b, strict=True)]))
-    return BootstrapInterval(difference, float(low), float(high), min(len(outcomes) for outcomes in (*a, *b)))
+    return float(low), float(high)
 
 
 def _weights(rng: np.random.Generator, resamples: int, n: int) -> np.ndarray:

@@ -231,7 +231,7 @@ def _contest(mode: Mode, tasks: Sequence[str], pair: tuple[str, str], outcomes: 
     if len(tasks) == 1 and fewest == 1:
         interval, (low, high) = "Newcombe", paired_difference_interval(_table(tables_a[0], tables_b[0]))
     else:
-        interval, (_, low, high, _) = "bootstrap", hierarchical_bootstrap(tables_a, tables_b)
+        interval, (low, high) = "bootstrap", hierarchical_bootstrap(tables_a, tables_b)
     if only_a == only_b == 0 and interval == "bootstrap":  # resampling cannot show what no episode has shown
         high = wilson_interval(0, len(by_seed))[1]
         interval, low = "Wilson", -high

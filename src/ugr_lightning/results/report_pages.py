@@ -3,7 +3,6 @@
 import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass, field
 from itertools import product
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 from ugr_lightning.results.conclusions import conclude, described_execution
 from ugr_lightning.results.report import ALL_TASKS, Contest, Mode, Rate, Report
 from ugr_lightning.results.results import Summary, wilson_interval
+from ugr_lightning.results.tables import Cells, as_markdown
 from ugr_lightning.system.files import publish_text
 
 METHOD = (
@@ -24,29 +24,13 @@ METHOD = (
 )
 
 
-@dataclass
-class Section:
-    """A part of the report.
-
-    Args:
-        title: its heading.
-        lists: sentences under a heading each.
-        paragraphs: Markdown with `code` only, as in the sentences.
-        table: head and rows, or empty.
-    """
-
-    title: str
-    lists: list[tuple[str, list[str]]] = field(default_factory=list)
-    paragraphs: list[str] = field(default_factory=list)
-    table: list[Sequence[str]] = field(default_factory=list)
-
-
 def write_report(report: Report, folder: Path, title: str) -> list[Path]:
     """Write `report.md`, `rates.csv` and `comparisons.csv` into a folder; returns their paths."""
+    contests = [(*c.mode, *(getattr(c, name) for name in CONTEST_HEAD[2:])) for c in report.contests]
     texts = {
         "report.md": to_markdown(report, title),
-        "rates.csv": _csv(RATE_HEAD, rate_records(report.rates)),
-        "comparisons.csv": _csv(CONTEST_HEAD, contest_records(report.contests)),
+        "rates.csv": _csv(RATE_HEAD, _rate_records(report.rates)),
+        "comparisons.csv": _csv(CONTEST_HEAD, contests),
     }
     for name, text in texts.items():
         publish_text(folder / name, text)
@@ -54,41 +38,29 @@ def write_report(report: Report, folder: Path, title: str) -> list[Path]:
 
 
 def to_markdown(report: Report, title: str) -> str:
-    """The report as Markdown, tables included."""
-    parts = [f"# {title}"]
-    for section in sections(report):
-        parts.append(f"## {section.title}")
-        for heading, items in section.lists:
-            parts += [f"**{heading}**", "\n".join(f"- {item}" for item in items)]
-        parts += section.paragraphs
-        if section.table:
-            head, *rows = section.table
-            lines = [head, ["---"] * len(head), *rows]
-            parts.append("\n".join("| " + " | ".join(cell.replace("|", "\\|") for cell in row) + " |" for row in lines))
-    return "\n\n".join(parts) + "\n"
+    """The report as Markdown: conclusion, overview, rates and comparisons by mode, method.
 
-
-def sections(report: Report) -> list[Section]:
-    """The report's parts in order: conclusion, overview, rates by mode, comparisons by mode, method."""
-    found = [Section("Conclusion", conclude(report).parts, report.remarks)]
+    Args:
+        report: what is told.
+        title: its heading.
+    """
+    parts = [f"# {title}", "## Conclusion", str(conclude(report)), *report.remarks]
     if report.rates:
-        found.append(Section("Overview", table=_overview_table(report)))
+        parts += ["## Overview", as_markdown(_overview_table(report))]
     for mode in dict.fromkeys(rate.mode for rate in report.rates):
         rates = [rate for rate in report.rates if rate.mode == mode]
         contests = [contest for contest in report.contests if contest.mode == mode]
-        place = _described(mode)
-        found.append(Section(f"Success: {place}", table=_rate_table(rates)))
+        parts += [f"## Success: {_described(mode)}", as_markdown(_rate_table(rates))]
         if contests:
-            found.append(Section(f"Comparisons: {place}", table=_contest_table(contests)))
-    found.append(Section("Method", paragraphs=[METHOD]))
-    return found
+            parts += [f"## Comparisons: {_described(mode)}", as_markdown(_contest_table(contests))]
+    return "\n\n".join([*parts, "## Method", METHOD]) + "\n"
 
 
 def _described(mode: Mode) -> str:
     return f"{mode.setting}, {described_execution(mode.execution)}"
 
 
-def _overview_table(report: Report) -> list[Sequence[str]]:
+def _overview_table(report: Report) -> Cells:
     """A row per policy and a column per mode; of several tasks, a row per mode too and a column per task."""
     one_setting = len({rate.mode.setting for rate in report.rates}) == 1
     totals: dict[str, dict[str, dict[str, Summary]]] = {}  # by mode, by policy, by task
@@ -99,7 +71,7 @@ def _overview_table(report: Report) -> list[Sequence[str]]:
     if len(tasks) > 1:
         head = ("policy", "execution" if one_setting else "setting and execution", *tasks, ALL_TASKS)
         return [head, *_overview_of_tasks(totals, report.policies, tasks)]
-    rows: list[Sequence[str]] = [("policy", *(f"{tasks[0]}, {mode}" for mode in totals))]
+    rows: Cells = [("policy", *(f"{tasks[0]}, {mode}" for mode in totals))]
     for policy in report.policies:
         found = [by_policy.get(policy, {}).get(tasks[0]) for by_policy in totals.values()]
         if any(found):
@@ -111,7 +83,7 @@ def _overview_table(report: Report) -> list[Sequence[str]]:
 
 def _overview_of_tasks(
     totals: dict[str, dict[str, dict[str, Summary]]], policies: Sequence[str], tasks: Sequence[str]
-) -> Iterator[Sequence[str]]:
+) -> Iterator[tuple[str, ...]]:
     """A row per mode and policy: each task, and their sum where each has as many episodes."""
     for mode, policy in product(totals, policies):
         by_task = totals[mode].get(policy)
@@ -129,8 +101,8 @@ def _counted(successes: int, n: int) -> str:
     return f"{successes}/{n} [{100 * low:.1f}, {100 * high:.1f}]"
 
 
-def _rate_table(rates: Sequence[Rate]) -> list[Sequence[str]]:
-    rows: list[Sequence[str]] = [("task", "policy", "success", "95 % interval", "by training seed", "crashed")]
+def _rate_table(rates: Sequence[Rate]) -> Cells:
+    rows: Cells = [("task", "policy", "success", "95 % interval", "by training seed", "crashed")]
     for rate in rates:
         total = rate.total
         seeds = ", ".join(f"{seed}: {part.successes}/{part.n}" for seed, part in rate.by_training_seed.items())
@@ -140,9 +112,9 @@ def _rate_table(rates: Sequence[Rate]) -> list[Sequence[str]]:
     return rows
 
 
-def _contest_table(contests: Sequence[Contest]) -> list[Sequence[str]]:
+def _contest_table(contests: Sequence[Contest]) -> Cells:
     head = ("task", "policies", "difference", "95 % interval", "n", "only first / second", "p", "p corrected")
-    rows: list[Sequence[str]] = [head]
+    rows: Cells = [head]
     for c in contests:
         interval = f"[{c.low:+.1%}, {c.high:+.1%}] {c.interval}"
         n = f"{c.seeds} seeds x {c.training_seeds}"
@@ -162,18 +134,13 @@ CONTEST_HEAD = (
 )
 
 
-def rate_records(rates: Iterable[Rate]) -> list[tuple[Any, ...]]:
+def _rate_records(rates: Iterable[Rate]) -> list[tuple[Any, ...]]:
     """One row per training seed, and one with `all` for their sum."""
     return [
         (*rate.mode, rate.task, rate.policy, seed, *part)
         for rate in rates
         for seed, part in [*rate.by_training_seed.items(), ("all", rate.total)]
     ]
-
-
-def contest_records(contests: Iterable[Contest]) -> list[tuple[Any, ...]]:
-    """One row per comparison."""
-    return [(*c.mode, *(getattr(c, name) for name in CONTEST_HEAD[2:])) for c in contests]
 
 
 def _csv(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from ugr_lightning.errors import DataError
+from ugr_lightning.results.tables import as_text
 from ugr_lightning.system.lock import flock
 
 Z_95 = 1.959963984540054
@@ -132,9 +133,7 @@ def success_table(results: Sequence[EpisodeResult]) -> str:
         total = summarize(group)
         interval = f"[{total.low:.1%}, {total.high:.1%}]"
         rows.append((*key, f"{total.successes}/{total.n} = {total.rate:.1%}", interval, str(total.crashed)))
-    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
+    return as_text(rows)
 
 
 def append_result(path: str | Path, result: EpisodeResult) -> None:

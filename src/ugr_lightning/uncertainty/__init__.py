@@ -12,7 +12,6 @@ _HOMES = {
     "calibration_figures": ("calibration_figure", "event_figure"),
     "calibration_report": (
         "around_events",
-        "as_markdown",
         "calibration_verdict",
         "compare_with_prior",
         "coverage_table",
@@ -24,6 +23,7 @@ _HOMES = {
     ),
     "events": ("find_events",),
     "predictions": ("open_data", "predict"),
+    "study": ("as_markdown",),
 }
 __all__ = [name for names in _HOMES.values() for name in names]
 

@@ -15,6 +15,7 @@ from ugr_lightning.models.refine.ranked import Ranked
 from ugr_lightning.models.refine.scattered import Scattered
 from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
+from ugr_lightning.results.tables import Cells
 from ugr_lightning.uncertainty.calibration import Interval, bootstrap, position_mean
 from ugr_lightning.uncertainty.predictions import Predictions
 
@@ -83,25 +84,17 @@ def sweep(
         ratios: budgets; 0 refines nothing.
         resamples: draws of the bootstrap over episodes.
     """
-    prior = position_mean(training_error)
-    names = list(selectors(1.0, prior, everything))
-    steps = everything.coarse.shape[1]
-    sums, counts = [], (~np.isnan(everything.coarse)).sum(1)  # (n,)
+    prior, steps = position_mean(training_error), everything.coarse.shape[1]
+    names, errors = list(selectors(1.0, prior, everything)), list[np.ndarray]()
     for ratio in ratios:
         if ratio * steps + 1e-9 < 1:
-            sums += [np.nansum(everything.coarse, axis=1)] * len(names)
-            continue
-        for selector, score in selectors(ratio, prior, everything).values():
-            sums.append(np.nansum(refined_error(everything, selector, score), axis=1))
-    totals, coarse = np.stack(sums), np.nansum(everything.coarse, axis=1)  # (ratios selectors, n), (n,)
-
-    def means(rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([totals[:, rows].sum(1), (totals[:, rows] - coarse[rows]).sum(1)]) / counts[rows].sum()
-
-    found = bootstrap(means, everything.episode, resamples)
-    table = {name: found[i : len(totals) : len(names)] for i, name in enumerate(names)}
-    differences = {name: found[len(totals) + i :: len(names)] for i, name in enumerate(names)}
-    return Sweep(tuple(ratios), table, differences)
+            errors += [everything.coarse] * len(names)
+        else:
+            errors += [refined_error(everything, *rule) for rule in selectors(ratio, prior, everything).values()]
+    found = _beside_coarse(errors, everything, resamples)
+    by_name = {name: found[i :: len(names)] for i, name in enumerate(names)}
+    error = {name: [one.error for one in of] for name, of in by_name.items()}
+    return Sweep(tuple(ratios), error, {name: [one.against_coarse for one in of] for name, of in by_name.items()})
 
 
 class BudgetError(NamedTuple):
@@ -123,24 +116,30 @@ def budget_errors(policy: ChunkPolicy, everything: Predictions, ratios: Sequence
         everything: its predictions with all steps refined.
         ratios: shares of the chunk; what rounds down to no step refines none.
     """
-    known = ~np.isnan(everything.coarse)
-    score = np.zeros(known.shape) if everything.log_variance is None else everything.log_variance
+    score = np.zeros(everything.coarse.shape) if everything.log_variance is None else everything.log_variance
     errors = []
     for ratio in ratios:
         selector: Any = getattr(with_refine_ratio(policy, ratio), "refine", None)
         errors.append(everything.coarse if selector is None else refined_error(everything, selector, score))
-    sums, coarse = np.nansum(errors, axis=2), np.nansum(everything.coarse, axis=1)  # (ratios, n), (n,)
+    return _beside_coarse(errors, everything)
+
+
+def _beside_coarse(errors: Sequence[np.ndarray], everything: Predictions, resamples: int = 500) -> list[BudgetError]:
+    """The mean of each (n, K) error, and of what it is above that of the coarse actions, with intervals."""
+    sums = np.stack([np.nansum(error, axis=1) for error in (*errors, everything.coarse)])  # (errors + 1, n)
+    counts = (~np.isnan(everything.coarse)).sum(1)  # (n,)
 
     def means(rows: np.ndarray) -> np.ndarray:
-        return np.concatenate([sums[:, rows].sum(1), (sums[:, rows] - coarse[rows]).sum(1)]) / known[rows].sum()
+        of = sums[:, rows].sum(1) / counts[rows].sum()  # (errors + 1,)
+        return np.concatenate([of[:-1], of[:-1] - of[-1]])
 
-    found = bootstrap(means, everything.episode)
+    found = bootstrap(means, everything.episode, resamples)
     return [BudgetError(*pair) for pair in zip(found[: len(errors)], found[len(errors) :], strict=True)]
 
 
-def sweep_table(found: Sweep) -> list[tuple[str, ...]]:
+def sweep_table(found: Sweep) -> Cells:
     """Error by budget and selector as cells, heading first."""
-    cells: list[tuple[str, ...]] = [("refined", *found.error, "s_k - coarse")]
+    cells: Cells = [("refined", *found.error, "s_k - coarse")]
     for i, ratio in enumerate(found.ratios):
         errors = [f"{intervals[i].value:.4f}" for intervals in found.error.values()]
         cells.append((f"{ratio:.0%}", *errors, _signed(found.against_coarse["learned"][i])))

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ugr_lightning.data.episode import Episode
+from ugr_lightning.results.tables import Cells
 from ugr_lightning.uncertainty import calibration as kit
 from ugr_lightning.uncertainty.calibration import Interval
 from ugr_lightning.uncertainty.events import (
@@ -22,10 +23,6 @@ REACH = 20
 NEAR = 5
 """Control steps around an event that count as near it."""
 RECALL, WITHIN = "recall of the worst steps", "Spearman within position"
-
-
-Cells = list[tuple[str, ...]]
-"""A table, heading first."""
 
 
 class Row(NamedTuple):
@@ -227,9 +224,9 @@ def around_events(validation: Predictions, episodes: list[Episode], resamples: i
     return found
 
 
-def table(rows: list[Row]) -> list[tuple[str, ...]]:
+def table(rows: list[Row]) -> Cells:
     """The comparison as cells, heading first."""
-    cells: list[tuple[str, ...]] = [
+    cells: Cells = [
         ("statistic", "better", "s_k", "position prior", "constant or chance", "s_k - prior")
     ]
     for row in rows:
@@ -238,9 +235,9 @@ def table(rows: list[Row]) -> list[tuple[str, ...]]:
     return cells
 
 
-def event_table(events: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
+def event_table(events: dict[str, dict[str, Any]]) -> Cells:
     """Error and predicted deviation near events over those elsewhere, as cells, heading first."""
-    cells: list[tuple[str, ...]] = [
+    cells: Cells = [
         ("event", "count", f"error within {NEAR} steps / elsewhere", "predicted deviation, likewise")
     ]
     for kind, of in events.items():
@@ -248,10 +245,10 @@ def event_table(events: dict[str, dict[str, Any]]) -> list[tuple[str, ...]]:
     return cells
 
 
-def coverage_table(found: dict[str, Any]) -> list[tuple[str, ...]]:
+def coverage_table(found: dict[str, Any]) -> Cells:
     """Nominal and actual coverage, as cells, heading first."""
     of = found["coverage"]
-    cells: list[tuple[str, ...]] = [("nominal coverage", "s_k", "position only", "constant variance")]
+    cells: Cells = [("nominal coverage", "s_k", "position only", "constant variance")]
     for level, *actual in zip(of["levels"], of["learned"], of["position"], of["constant"], strict=True):
         cells.append((f"{level:.0%}", *(f"{value:.0%}" for value in actual)))
     return cells
@@ -261,21 +258,8 @@ def _cell(interval: Interval) -> str:
     return "-" if np.isnan(interval.value) else str(interval)
 
 
-def generalisation_table(found: dict[str, dict[str, float]]) -> list[tuple[str, ...]]:
+def generalisation_table(found: dict[str, dict[str, float]]) -> Cells:
     """`generalisation` as cells, heading first."""
     names = list(found["training"])
     rows = [(name, *(f"{part[name]:.3g}" for part in found.values())) for name in names]
     return [("s_k on episodes of the", *found), *rows]
-
-
-def as_text(cells: list[tuple[str, ...]]) -> str:
-    """Cells as an aligned table for the terminal."""
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in cells]
-    return "\n".join([lines[0], "  ".join("-" * width for width in widths), *lines[1:]])
-
-
-def as_markdown(cells: list[tuple[str, ...]]) -> str:
-    """Cells as a Markdown table."""
-    lines = [f"| {' | '.join(row)} |" for row in cells]
-    return "\n".join([lines[0], "|" + "---|" * len(cells[0]), *lines[1:]])

@@ -9,8 +9,8 @@ from ugr_lightning.results.conclusions import LEVEL, described_execution
 from ugr_lightning.results.pooled import holm
 from ugr_lightning.results.results import EpisodeResult, Summary, summarize
 from ugr_lightning.results.stats import Comparison, compare
+from ugr_lightning.results.tables import Cells
 from ugr_lightning.uncertainty.budgets import BudgetError
-from ugr_lightning.uncertainty.calibration_report import Cells
 
 
 class Use(NamedTuple):

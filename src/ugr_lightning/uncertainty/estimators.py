@@ -15,6 +15,7 @@ from ugr_lightning.contract import Chunk, Observation
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.transformer import Dropout, drop
+from ugr_lightning.results.tables import Cells
 from ugr_lightning.uncertainty import calibration as kit
 from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, batches
 
@@ -128,7 +129,7 @@ def estimate(
     return {"MC dropout": dropped, "CVAE samples": styles, "overlapping chunks": overlap}
 
 
-def estimator_table(validation: Predictions, estimates: dict[str, np.ndarray], budget: int) -> list[tuple[str, ...]]:
+def estimator_table(validation: Predictions, estimates: dict[str, np.ndarray], budget: int) -> Cells:
     """Each estimate beside s_k on the same steps, as cells, heading first.
 
     Args:
@@ -138,7 +139,7 @@ def estimator_table(validation: Predictions, estimates: dict[str, np.ndarray], b
     """
     learned = validation.log_variance
     assert learned is not None
-    cells: list[tuple[str, ...]] = [
+    cells: Cells = [
         ("estimator", "steps", "Spearman", "within position", "recall", "recall of s_k", "difference", "AUSE")
     ]
     for name, score in {"s_k": learned, **estimates}.items():

@@ -11,7 +11,7 @@ import torch
 
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.uncertainty.calibration_report import Cells
+from ugr_lightning.results.tables import Cells
 from ugr_lightning.uncertainty.predictions import batches
 
 BADLY_FITTED = 0.5

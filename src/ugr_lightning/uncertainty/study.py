@@ -10,9 +10,10 @@ from typing import Any
 
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.errors import CheckpointError, ConfigError, DataError
+from ugr_lightning.errors import CheckpointError, DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
+from ugr_lightning.results.tables import Cells, as_markdown, as_text
 from ugr_lightning.rollout.traces import read_traces
 from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
@@ -49,12 +50,12 @@ class Study:
     resamples: int
     budget: int
     content: dict[str, Any]
-    tables: list[report.Cells]
+    tables: list[Cells]
     figures: dict[str, Any]
     sentences: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
-        return "\n\n".join([*map(report.as_text, self.tables), *self.sentences])
+        return "\n\n".join([*map(as_text, self.tables), *self.sentences])
 
     def write(self, folder: Path) -> None:
         """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
@@ -69,7 +70,7 @@ def write_page(
     name: str,
     title: str,
     sentences: Sequence[str],
-    tables: Sequence[report.Cells],
+    tables: Sequence[Cells],
     figures: dict[str, Any],
     content: dict[str, Any],
 ) -> None:
@@ -85,7 +86,7 @@ def write_page(
         content: numbers.
     """
     pictures = [f"![{figure}]({figure}.png)" for figure in figures]
-    page = "\n\n".join([f"# {title}", *sentences, *map(report.as_markdown, tables), *pictures])
+    page = "\n\n".join([f"# {title}", *sentences, *map(as_markdown, tables), *pictures])
     numbers = json.dumps(plain_json(content), indent=1, allow_nan=False)
     for file, text in ((f"{name}.json", numbers), (f"{name}.md", page)):
         publish_text(folder / file, text + "\n")
@@ -138,15 +139,6 @@ def begin_study(
     return Study(policy, data, validation, training, stride, resamples, budget, content, tables, figures, sentences)
 
 
-def require_budgets(policy: ChunkPolicy) -> None:
-    """Check that a policy can refine another share of its chunks.
-
-    Raises:
-        ConfigError: it does not rank steps.
-    """
-    with_refine_ratio(policy, 1.0)
-
-
 def add_budgets(study: Study) -> None:
     """Add the error when from none to all of the steps are refined."""
     whole = with_refine_ratio(study.policy, 1.0).for_inference()
@@ -155,16 +147,6 @@ def add_budgets(study: Study) -> None:
     study.content["budgets"] = found
     study.tables.append(sweep_table(found))
     study.figures["budgets"] = sweep_figure(found)
-
-
-def require_estimators(policy: ChunkPolicy) -> None:
-    """Check that a policy can give other estimates of its uncertainty.
-
-    Raises:
-        ConfigError: it has neither dropout nor latents.
-    """
-    if not isinstance(policy, ACT):
-        raise ConfigError("--estimators", "a policy of the class ACT", type(policy).__name__, "Leave it out.")
 
 
 def add_estimators(study: Study) -> None:
