@@ -94,15 +94,15 @@ def test_the_network_of_the_paper_is_imported_whole():
         paper = ReferenceACT()
         ours = ACT(decoder_readout="first").state_dict()
     assert sum(parameter.numel() for parameter in paper.parameters()) == 83_897_487
-    found = translate({f"model.{n}": v for n, v in paper.state_dict().items()}, ORIGINAL, "paper", DEAD)
+    found, unused = translate({f"model.{n}": v for n, v in paper.state_dict().items()}, ORIGINAL, "paper", DEAD)
     shapes = {name: value.shape for name, value in ours.items()}
     for name in [n for n in shapes if n.startswith("normalizer.")] + ["backbone.pretrained"]:
         del shapes[name]
-    assert {name: value.shape for name, value in found.weights.items()} == shapes
-    assert sum(value.numel() for value in found.unused.values()) == 6 * 5_384_832 + 513
+    assert {name: value.shape for name, value in found.items()} == shapes
+    assert sum(value.numel() for value in unused.values()) == 6 * 5_384_832 + 513
     sizes = {"dim": 512, "feedforward": 3200, "encoder_layers": 4, "decoder_layers": 1, "cvae_layers": 4}
     sizes |= {"latent_dim": 32, "chunk_length": 50, "state_dim": 14, "action_dim": 14, "backbone_width": 64}
-    assert sizes_of(found.weights, ORIGINAL, "paper") == sizes
+    assert sizes_of(found, ORIGINAL, "paper") == sizes
 
 
 def trained(**options):

@@ -4,7 +4,7 @@ from pathlib import Path
 import pytest
 import torch
 from published_act import MEAN, STD, LeRobotACT, seen, small
-from safetensors.torch import save_file
+from safetensors.torch import load_file, save_file
 
 from ugr_lightning.bridges.lerobot_folder import export_lerobot
 from ugr_lightning.bridges.lerobot_policy import import_lerobot
@@ -85,13 +85,20 @@ def named(network):
     return {f"model.{name}": value for name, value in network.state_dict().items()}
 
 
+def imported(folder, weights, about=None, **options):
+    """What comes of a folder with these weights and this `config.json`."""
+    (folder / "config.json").write_text(json.dumps(about or config()))
+    save_file(weights, folder / "model.safetensors")
+    return import_lerobot(folder, **options)
+
+
 @pytest.mark.parametrize("mode", ["MEAN_STD", "MIN_MAX", "QUANTILES"])
 def test_an_imported_policy_commands_what_lerobot_commands(tmp_path, network, statistics, mode):
     write_processors(tmp_path, statistics)
     about = config(normalization_mapping={"VISUAL": "MEAN_STD", "STATE": mode, "ACTION": mode})
-    policy, facts = import_lerobot(about, named(network), tmp_path)
+    policy, image_size, _ = imported(tmp_path, named(network), about)
     assert policy.cameras == ("top", "wrist")
-    assert facts.image_size == (64, 96)
+    assert image_size == (64, 96)
     images, state = seen()
     theirs = executed(network, statistics, images, state, mode)
     assert theirs.std(dim=(0, 1)).min() > 1e-3, "the comparison is of numbers that differ"
@@ -106,7 +113,7 @@ def test_statistics_are_found_in_the_weights_of_older_versions(tmp_path, network
         old[f"{group}.buffer_{feature.replace('.', '_')}.{name}"] = value
     old["normalize_targets.buffer_action.mean"] = statistics["action.mean"]
     old["normalize_targets.buffer_action.max"] = torch.tensor(torch.inf)  # never fitted, never read
-    policy, _ = import_lerobot(config(), {**named(network), **old}, tmp_path, cameras=("cam_high", "cam_wrist"))
+    policy, *_ = imported(tmp_path, {**named(network), **old}, cameras=("cam_high", "cam_wrist"))
     assert policy.cameras == ("cam_high", "cam_wrist")
     images, state = seen()
     theirs = executed(network, statistics, images, state)
@@ -115,21 +122,17 @@ def test_statistics_are_found_in_the_weights_of_older_versions(tmp_path, network
 
 def test_an_exported_policy_is_written_as_lerobot_would_and_comes_back(tmp_path, network, statistics):
     write_processors(tmp_path, statistics)
-    policy, _ = import_lerobot(config(), named(network), tmp_path)
-    back = export_lerobot(policy, (64, 96))
-    weights = back.tensors.pop("model.safetensors")
+    policy, *_ = imported(tmp_path, named(network))
+    folder = tmp_path / "exported"
+    folder.mkdir()
+    export_lerobot(policy, folder, (64, 96))
+    weights = load_file(folder / "model.safetensors")
     assert set(weights) == set(named(network))
     for name, value in named(network).items():
         torch.testing.assert_close(weights[name], value, atol=1e-6 if "pos_enc" in name else 0, rtol=0)
-    for key, value in back.tensors["policy_preprocessor_step_3_normalizer_processor.safetensors"].items():
+    for key, value in load_file(folder / "policy_preprocessor_step_3_normalizer_processor.safetensors").items():
         torch.testing.assert_close(value, statistics[key], atol=1e-7, rtol=0)
-    folder = tmp_path / "exported"
-    folder.mkdir()
-    for name, content in back.objects.items():
-        (folder / name).write_text(json.dumps(content))
-    for name, tensors in back.tensors.items():
-        save_file(tensors, folder / name)
-    again, _ = import_lerobot(back.objects["config.json"], weights, folder)
+    again, *_ = import_lerobot(folder)
     images, state = seen()
     first, second = (one.predict(Observation(images, state)).actions for one in (policy, again))
     torch.testing.assert_close(first, second, atol=1e-6, rtol=0)
@@ -139,7 +142,7 @@ def test_what_lerobot_has_no_place_for_is_refused():
     sizes = {"dim": 16, "heads": 2, "feedforward": 8, "encoder_layers": 1, "decoder_layers": 2, "cvae_layers": 0}
     for options, complaint in (({"keypoints": 2}, "keypoints"), ({"causal": True}, "causal")):
         with pytest.raises(ConfigError, match=complaint):
-            export_lerobot(ACT(**sizes, **options), (64, 96))
+            export_lerobot(ACT(**sizes, **options), Path(), (64, 96))
 
 
 @pytest.mark.parametrize(
@@ -159,7 +162,7 @@ def test_what_lerobot_has_no_place_for_is_refused():
 def test_other_networks_are_refused_by_what_differs(tmp_path, network, statistics, changed, complaint):
     write_processors(tmp_path, statistics)
     with pytest.raises(CheckpointError, match=complaint):
-        import_lerobot(config(**changed), named(network), tmp_path)
+        imported(tmp_path, named(network), config(**changed))
 
 
 def test_unusable_statistics_are_refused_by_name(tmp_path, network, statistics):
@@ -171,14 +174,14 @@ def test_unusable_statistics_are_refused_by_name(tmp_path, network, statistics):
     for changed, complaint in bad:
         write_processors(tmp_path, {**statistics, **changed})
         with pytest.raises(CheckpointError, match=complaint):
-            import_lerobot(config(), named(network), tmp_path)
+            imported(tmp_path, named(network))
     (tmp_path / "policy_preprocessor.json").unlink()
     with pytest.raises(CheckpointError, match="policy_preprocessor"):
-        import_lerobot(config(), named(network), tmp_path)
+        imported(tmp_path, named(network))
 
 
 def test_a_processor_cannot_point_outside_its_folder(tmp_path, network):
     steps = [{"registry_name": "normalizer_processor", "state_file": "../../secret.safetensors"}]
     (tmp_path / "policy_preprocessor.json").write_text(json.dumps({"steps": steps}))
     with pytest.raises(CheckpointError, match="secret"):
-        import_lerobot(config(), named(network), tmp_path)
+        imported(tmp_path, named(network))

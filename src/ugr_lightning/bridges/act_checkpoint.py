@@ -94,9 +94,9 @@ def import_act(
 
     Source: tonyzhaozh/act@742c753, detr/models/detr_vae.py (names).
     """
-    found = translate(checked_tensors(content, where), ORIGINAL, where, DEAD)
-    sizes = sizes_of(found.weights, ORIGINAL, where)
-    dead_layers = {name.split(".")[3] for name in found.unused if name.startswith("transformer.decoder.layers.")}
+    found, unused = translate(checked_tensors(content, where), ORIGINAL, where, DEAD)
+    sizes = sizes_of(found, ORIGINAL, where)
+    dead_layers = {name.split(".")[3] for name in unused if name.startswith("transformer.decoder.layers.")}
     sizes["decoder_layers"] += len(dead_layers)
     arguments = {
         **sizes,
@@ -111,10 +111,9 @@ def import_act(
         if given != dim:
             fix = "Give the `dataset_stats.pkl` that lies beside this checkpoint."
             raise CheckpointError(f"statistics of {where}: {part}_mean", f"{dim} numbers", given, fix)
-    policy = build(found.weights, arguments, ORIGINAL, where)
+    policy = build(found, arguments, ORIGINAL, where)
     set_normalisation(policy, *statistics[:4])
-    extra = {"unused": found.unused, "example_qpos": statistics.example_qpos}
-    return policy, extra
+    return policy, {"unused": unused, "example_qpos": statistics.example_qpos}
 
 
 def set_normalisation(

@@ -41,19 +41,6 @@ class Dialect:
         return None if found is None else self.prefix + found
 
 
-@dataclass(frozen=True)
-class Translated:
-    """A foreign network under our names.
-
-    Args:
-        weights: by our names, shaped as in `ACT`.
-        unused: by their names, without the prefix: tensors that no output depends on.
-    """
-
-    weights: dict[str, Tensor]
-    unused: dict[str, Tensor]
-
-
 def _swap(name: str, pairs: Sequence[tuple[str, str]]) -> str | None:
     for old, new in pairs:
         if name == old or (old.endswith(".") and name.startswith(old)):
@@ -94,7 +81,9 @@ def checked_tensors(content: Mapping[str, Any], where: object, ignore: tuple[str
     return found
 
 
-def translate(weights: Mapping[str, Tensor], dialect: Dialect, where: object, dead: Sequence[str] = ()) -> Translated:
+def translate(
+    weights: Mapping[str, Tensor], dialect: Dialect, where: object, dead: Sequence[str] = ()
+) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
     """Give the tensors of a foreign checkpoint our names; every one of them is accounted for.
 
     Args:
@@ -102,6 +91,10 @@ def translate(weights: Mapping[str, Tensor], dialect: Dialect, where: object, de
         dialect: whose names they are.
         where: the file, for messages.
         dead: beginnings of their names of what no output depends on.
+
+    Returns:
+        The tensors under our names, shaped as in `ACT`; and under theirs, without the prefix, those that no output
+        depends on.
 
     Raises:
         CheckpointError: a tensor that is neither known nor dead, or a position table other than the usual one.
@@ -127,7 +120,7 @@ def translate(weights: Mapping[str, Tensor], dialect: Dialect, where: object, de
         got = f"{len(strangers)} others: {', '.join(sorted(strangers)[:6])}"
         fix = "Only ACT with a ResNet-18 can be imported, not other policies and not changed networks."
         raise CheckpointError(where, f"the names of {dialect.name} ACT", got, fix)
-    return Translated(found, unused)
+    return found, unused
 
 
 def _check_positions(table: Tensor, where: str) -> None:

@@ -1,7 +1,6 @@
 """Policies of ours for other programs: written aside, read back, compared, and only then put in place."""
 
-import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -18,15 +17,7 @@ from ugr_lightning.contract import ChunkPolicy, Observation
 from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.checkpoint import PolicyInfo, load_policy, read_checkpoint
-from ugr_lightning.models.policy_folder import (
-    CONFIG,
-    WEIGHTS,
-    read_json,
-    read_policy_folder,
-    read_safetensors,
-    write_policy_folder,
-    write_safetensors,
-)
+from ugr_lightning.models.policy_folder import write_policy_folder
 from ugr_lightning.results.results import EpisodeResult, read_results
 from ugr_lightning.system.files import publish_folder
 
@@ -53,9 +44,7 @@ class Exported(NamedTuple):
 class _Job(NamedTuple):
     policy: ChunkPolicy
     info: PolicyInfo
-    content: dict[str, Any]
     observation: Observation
-    image_size: tuple[int, int]
     drop_refinement: bool
 
 
@@ -86,14 +75,11 @@ def export_policy(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError("--out", "a folder that does not exist yet, or is empty", out, "Choose another folder.")
     policy, info = load_policy(checkpoint)
-    content = read_policy_folder(checkpoint) if checkpoint.is_dir() else read_checkpoint(checkpoint)
     size = image_size or info.data.get("image_size")
     if size is None:
         fix = "Give the images' height and width, e.g. `--image_size [480,640]`."
         raise ConfigError("--image_size", "a size, since the checkpoint names none", None, fix)
-    height, width = size
-    observation = made_up_observation(policy, (height, width))
-    job = _Job(policy, info, content, observation, (height, width), drop_refinement)
+    job = _Job(policy, info, made_up_observation(policy, size), drop_refinement)
     done: list[Exported] = []
 
     def write(folder: Path) -> None:
@@ -119,7 +105,7 @@ def export_policy(
     return done[0]
 
 
-def made_up_observation(policy: ChunkPolicy, image_size: tuple[int, int], samples: int = 3) -> Observation:
+def made_up_observation(policy: ChunkPolicy, image_size: Sequence[int], samples: int = 3) -> Observation:
     """Noise that a policy can look at: always the same, states spread as in its training.
 
     Args:
@@ -166,7 +152,8 @@ def _results(checkpoint: Path, info: PolicyInfo) -> list[EpisodeResult]:
 
 def _act(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
     policy = _require_act(job, "act")
-    made = export_act(policy, job.content.get(EXTRA), drop_refinement=job.drop_refinement)
+    extra = None if job.info.path.is_dir() else read_checkpoint(job.info.path).get(EXTRA)
+    made = export_act(policy, extra, drop_refinement=job.drop_refinement)
     torch.save(made.weights, folder / "policy_best.ckpt")
     (folder / "dataset_stats.pkl").write_bytes(write_act_statistics(made.statistics))
     content = read_checkpoint(folder / "policy_best.ckpt")
@@ -177,13 +164,10 @@ def _act(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
 
 
 def _lerobot(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
-    made = export_lerobot(_require_act(job, "lerobot"), job.image_size, drop_refinement=job.drop_refinement)
-    for name, content in made.objects.items():
-        (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    for name, tensors in made.tensors.items():
-        write_safetensors(folder / name, tensors)
-    again, _ = import_lerobot(read_json(folder / CONFIG), read_safetensors(folder / WEIGHTS), folder)
-    return _asked(again), made.notes
+    policy = _require_act(job, "lerobot")
+    height, width = job.observation.images.shape[-2:]
+    notes = export_lerobot(policy, folder, (height, width), drop_refinement=job.drop_refinement)
+    return _asked(import_lerobot(folder)[0]), notes
 
 
 def _safetensors(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
@@ -203,7 +187,7 @@ def _torch(job: _Job, folder: Path) -> tuple[Graph, list[str]]:
 
 
 def _of_graph(job: _Job) -> list[str]:
-    height, width = job.image_size
+    height, width = job.observation.images.shape[-2:]
     return [
         f"the graph takes images of {height} x {width} (height x width), any number of samples, and computes in fp32"
     ]

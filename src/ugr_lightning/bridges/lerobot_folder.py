@@ -4,7 +4,9 @@ lerobot's own evaluation loop calls it: `lerobot-eval --policy.path=FOLDER`. ler
 exclude each other, so that they live in two environments, and the folder is what they share.
 """
 
-from typing import Any, NamedTuple
+import json
+from pathlib import Path
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,30 +14,23 @@ from torch import Tensor
 from ugr_lightning.bridges.act_layout import check_plain, untranslate
 from ugr_lightning.bridges.lerobot_policy import ACTION, EPSILON, IMAGES, LEROBOT, STATE
 from ugr_lightning.models.act import ACT
+from ugr_lightning.models.policy_folder import CONFIG, WEIGHTS, write_safetensors
 from ugr_lightning.models.vision import IMAGENET_MEAN, IMAGENET_STD
 
 
-class LeRobotFolder(NamedTuple):
-    """The files of a policy as lerobot writes them, by name.
-
-    Args:
-        tensors: of each `.safetensors` file.
-        objects: content of each `.json` file.
-        notes: sentences about what was left behind.
-    """
-
-    tensors: dict[str, dict[str, Tensor]]
-    objects: dict[str, dict[str, Any]]
-    notes: list[str]
-
-
-def export_lerobot(policy: ACT, image_size: tuple[int, int], *, drop_refinement: bool = False) -> LeRobotFolder:
+def export_lerobot(
+    policy: ACT, folder: Path, image_size: tuple[int, int], *, drop_refinement: bool = False
+) -> list[str]:
     """Write a policy of ours as lerobot would.
 
     Args:
         policy: plain ACT at the published structure.
+        folder: where to.
         image_size: H and W of its images.
         drop_refinement: leave a refinement branch and an uncertainty head behind.
+
+    Returns:
+        Sentences about what was left behind.
 
     Raises:
         ConfigError: lerobot has no place for something that the policy has.
@@ -89,15 +84,19 @@ def export_lerobot(policy: ACT, image_size: tuple[int, int], *, drop_refinement:
     back = {**settings, "features": command}
     last = {"registry_name": "unnormalizer_processor", "config": back, "state_file": unscale}
     objects: dict[str, dict[str, Any]] = {
-        "config.json": config,
+        CONFIG: config,
         f"{before}.json": {"name": before, "steps": steps},
         f"{after}.json": {"name": after, "steps": [last, device]},
     }
-    tensors = {"model.safetensors": untranslate(policy, LEROBOT), scale: statistics, unscale: statistics}
+    for name, content in objects.items():
+        (folder / name).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_safetensors(folder / WEIGHTS, untranslate(policy, LEROBOT))
+    for name in (scale, unscale):
+        write_safetensors(folder / name, statistics)
     notes = [f"lerobot executes all {policy.chunk_length} steps of a chunk; `--policy.n_action_steps` changes that"]
     if policy.branch is not None or policy.uncertainty_head is not None:
         notes.append("the refinement branch and the uncertainty head were left behind")
-    return LeRobotFolder(tensors, objects, notes)
+    return notes
 
 
 def _written_statistics(policy: ACT) -> dict[str, Tensor]:
@@ -111,4 +110,4 @@ def _written_statistics(policy: ACT) -> dict[str, Tensor]:
     for name in policy.cameras:
         for part, numbers in (("mean", IMAGENET_MEAN), ("std", IMAGENET_STD)):
             found[f"{IMAGES}{name}.{part}"] = torch.tensor(numbers).view(3, 1, 1)
-    return {name: value.detach().cpu().clone() for name, value in found.items()}
+    return found

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -17,7 +17,7 @@ from ugr_lightning.bridges.act_layout import (
 )
 from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.act import ACT
-from ugr_lightning.models.policy_folder import read_json, read_safetensors
+from ugr_lightning.models.policy_folder import CONFIG, WEIGHTS, read_json, read_safetensors
 from ugr_lightning.models.precision import Precision
 from ugr_lightning.models.vision import IMAGENET_MEAN, IMAGENET_STD
 
@@ -52,50 +52,33 @@ _FIX = "Only ACT with a ResNet-18, images and joint states can be imported."
 _RANGES = {"MIN_MAX": ("min", "max"), "QUANTILES": ("q01", "q99"), "QUANTILE10": ("q10", "q90")}
 
 
-class LeRobotFacts(NamedTuple):
-    """What a folder says beside the weights.
-
-    Args:
-        image_size: H and W of the images.
-        notes: sentences for the user.
-    """
-
-    image_size: tuple[int, int]
-    notes: list[str]
-
-
 def import_lerobot(
-    config: Mapping[str, Any],
-    weights: Mapping[str, Tensor],
-    folder: Path,
-    *,
-    cameras: Sequence[str] | None = None,
-    precision: Precision = "fp32",
-) -> tuple[ACT, LeRobotFacts]:
+    folder: Path, *, cameras: Sequence[str] | None = None, precision: Precision = "fp32"
+) -> tuple[ACT, tuple[int, int], list[str]]:
     """Make a policy of ours from an ACT policy of lerobot's.
 
     Args:
-        config: content of `config.json`.
-        weights: content of `model.safetensors`.
-        folder: where the processors' files are, which newer versions keep the statistics in.
+        folder: `pretrained_model`, with `config.json`, `model.safetensors` and, of newer versions, the processors' files.
         cameras: new names for the cameras, in the order of `input_features`; None takes lerobot's.
         precision: arithmetic of the trunk; `fp32` is lerobot's.
+
+    Returns:
+        The policy, height and width of its images, and sentences for the user.
 
     Raises:
         CheckpointError: another kind of policy, a network that ours cannot express, missing or unusable statistics.
 
     Source: huggingface/lerobot@7427f31, src/lerobot/policies/act and src/lerobot/processor.
     """
-    where = folder / "config.json"
+    where, place = folder / CONFIG, folder / WEIGHTS
+    config, weights = read_json(where), read_safetensors(place)
     _check_network(config, where)
     names, image_size = _cameras(config, where)
     if cameras is not None and len(cameras) != len(names):
         got = f"{len(cameras)}: {', '.join(cameras)}"
         raise ConfigError("--cameras", f"{len(names)} names, for {', '.join(names)}", got, "Name every camera once.")
-    place = folder / "model.safetensors"
-    tensors = checked_tensors(weights, place, ignore=_OLD)
-    found = translate(tensors, LEROBOT, place)
-    sizes = sizes_of(found.weights, LEROBOT, place)
+    found, _ = translate(checked_tensors(weights, place, ignore=_OLD), LEROBOT, place)
+    sizes = sizes_of(found, LEROBOT, place)
     arguments = {
         **sizes,
         "heads": _number(config, "n_heads", where),
@@ -103,7 +86,7 @@ def import_lerobot(
         "reconstruction": "l1",
         "precision": precision,
     }
-    policy = build(found.weights, arguments, LEROBOT, place)
+    policy = build(found, arguments, LEROBOT, place)
     statistics = _statistics(weights, folder)
     modes = config.get("normalization_mapping") or {}
     for name in names:
@@ -113,7 +96,7 @@ def import_lerobot(
     if modes.get("STATE") == "MEAN_STD":
         state = (state[0], state[1] + EPSILON)
     set_normalisation(policy, *state, *action)
-    return policy, LeRobotFacts(image_size, _notes(config))
+    return policy, image_size, [f"{len(weights)} tensors, none left over", _execution(config)]
 
 
 def _check_network(config: Mapping[str, Any], where: Path) -> None:
@@ -230,12 +213,9 @@ def _check_imagenet(statistics: Mapping[str, Mapping[str, Tensor]], feature: str
             raise CheckpointError(f"{folder}: {feature}.{name}", f"ImageNet's {numbers}", value.tolist()[:3], fix)
 
 
-def _notes(config: Mapping[str, Any]) -> list[str]:
-    notes = []
-    if config.get("temporal_ensemble_coeff") is not None:
-        coefficient = config["temporal_ensemble_coeff"]
-        notes.append(f"lerobot aggregates chunks with the coefficient {coefficient}: `--execution aggregate` uses 0.01")
-    else:
-        steps = config.get("n_action_steps")
-        notes.append(f"lerobot executes {steps} steps of each chunk: `--execution {steps}` does the same")
-    return notes
+def _execution(config: Mapping[str, Any]) -> str:
+    """How lerobot executes the chunks."""
+    coefficient, steps = config.get("temporal_ensemble_coeff"), config.get("n_action_steps")
+    if coefficient is not None:
+        return f"lerobot aggregates chunks with the coefficient {coefficient}: `--execution aggregate` uses 0.01"
+    return f"lerobot executes {steps} steps of each chunk: `--execution {steps}` does the same"

@@ -2,9 +2,10 @@
 
 import ast
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from ugr_lightning.bridges.deployment import WHOLE_CHUNKS
+from ugr_lightning.bridges.deployment import WHOLE_CHUNKS, Deployment
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.rollout.aggregation import AGGREGATE, AGGREGATE_VARIANCE
 
@@ -12,21 +13,46 @@ SWITCHES = {"true": True, "yes": True, "on": True, "1": True, "false": False, "n
 NOTHING = ("", "none", "null", "~")
 
 
-def switch(config: Mapping[str, Any], key: str) -> bool | None:
-    """A switch; None where it is not set.
+def deployment_of(
+    config: Mapping[str, Any],
+    checkpoint: Path,
+    *,
+    cameras: Mapping[str, str],
+    calibration: tuple[str, str],
+    slots: int = 1,
+) -> Deployment:
+    """The policy that another project's config asks for.
+
+    Args:
+        config: `execution`, and optionally `temporal_agg` (false without a number of steps means whole chunks, as in
+            ACT), `cameras`, `image_size`, `device`, `refine_ratio`. What its command line could not evaluate arrives as
+            strings, so "false" is false here and "25" a number.
+        checkpoint: the policy's file.
+        cameras: the environment's usual names of our cameras, which those of the config override.
+        calibration: see `Deployment`.
+        slots: how many environments at most.
 
     Raises:
-        ConfigError: neither yes nor no.
+        ConfigError: a value that cannot work.
+        CheckpointError: not a usable checkpoint.
 
-    Source: RoboTwin-Platform/RoboTwin@13c3c47, script/eval_policy.py: `--key false` arrives as "false",
-        which Python takes for true.
+    Source: RoboTwin-Platform/RoboTwin@13c3c47, script/eval_policy.py: `--key false` arrives as "false", which Python
+        takes for true.
     """
-    value = _value(config, key)
-    if value is None or isinstance(value, bool):
-        return value
-    if str(value).strip().lower() in SWITCHES:
-        return SWITCHES[str(value).strip().lower()]
-    raise ConfigError(key, "true or false", repr(value), "Correct the value.")
+    named = config.get("cameras") or {}
+    if not isinstance(named, Mapping) or not all(isinstance(name, str) for name in named.values()):
+        fix = "Write e.g. {cam_high: head_camera}."
+        raise ConfigError("cameras", "the environment's name of each of the policy's cameras", named, fix)
+    return Deployment(
+        checkpoint,
+        cameras={**cameras, **named},
+        calibration=calibration,
+        execution=_execution(config),
+        slots=slots,
+        image_size=_shape(config, "image_size"),
+        device=text(config, "device", "auto"),
+        refine_ratio=number(config, "refine_ratio"),
+    )
 
 
 def text(config: Mapping[str, Any], key: str, default: str | None = None) -> str:
@@ -56,12 +82,17 @@ def number(config: Mapping[str, Any], key: str) -> float | None:
         raise ConfigError(key, "a number", repr(value), "Correct the value.") from error
 
 
-def shape(config: Mapping[str, Any], key: str) -> tuple[int, int] | None:
-    """Height and width; None where they are not set.
+def _switch(config: Mapping[str, Any], key: str) -> bool | None:
+    value = _value(config, key)
+    if value is None or isinstance(value, bool):
+        return value
+    if str(value).strip().lower() in SWITCHES:
+        return SWITCHES[str(value).strip().lower()]
+    raise ConfigError(key, "true or false", repr(value), "Correct the value.")
 
-    Raises:
-        ConfigError: something else.
-    """
+
+def _shape(config: Mapping[str, Any], key: str) -> tuple[int, int] | None:
+    """Height and width; None where they are not set."""
     value = _value(config, key)
     if isinstance(value, str):
         try:
@@ -75,17 +106,10 @@ def shape(config: Mapping[str, Any], key: str) -> tuple[int, int] | None:
     raise ConfigError(key, "height and width", repr(value), "Write e.g. [120, 160].")
 
 
-def choose_execution(execution: Any, temporal_agg: bool | None) -> str | int:
-    """How chunks are executed, also where it is said in the words of ACT's evaluators.
-
-    Args:
-        execution: `aggregate`, `aggregate-variance`, `chunk`, or a number of steps; nothing means `aggregate`.
-        temporal_agg: false without a number of steps means whole chunks, as in ACT; None leaves it to `execution`.
-
-    Raises:
-        ConfigError: aggregation and a number of steps.
-    """
-    chosen = AGGREGATE if str(execution).strip().lower() in NOTHING else str(execution).strip()
+def _execution(config: Mapping[str, Any]) -> str | int:
+    """How chunks are executed, also where it is said in the words of ACT's evaluators."""
+    given, temporal_agg = _value(config, "execution"), _switch(config, "temporal_agg")
+    chosen = AGGREGATE if given is None else str(given).strip()
     averages = chosen in (AGGREGATE, AGGREGATE_VARIANCE)
     if temporal_agg is False and averages:
         return WHOLE_CHUNKS

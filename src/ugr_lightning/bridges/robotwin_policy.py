@@ -1,6 +1,7 @@
 """RoboTwin 2.0's policy interface: what the folder written by `ugr bridge robotwin` calls."""
 
 from collections.abc import Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -8,8 +9,8 @@ import numpy as np
 
 from ugr_lightning.bridges.adapter_files import write_adapter_folder
 from ugr_lightning.bridges.deployment import Deployment
-from ugr_lightning.bridges.options import choose_execution, number, shape, switch, text
-from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
+from ugr_lightning.bridges.options import deployment_of, text
+from ugr_lightning.errors import CheckpointError, ProtocolError
 
 CAMERAS = {"cam_high": "head_camera", "cam_right_wrist": "right_camera", "cam_left_wrist": "left_camera"}
 """RoboTwin's names of our cameras (RoboTwin-Platform/RoboTwin@13c3c47, envs/camera/camera.py)."""
@@ -48,11 +49,8 @@ class RobotwinModel:
 def get_model(usr_args: Mapping[str, Any], folder: Path | None = None) -> RobotwinModel:
     """Load the policy that `deploy_policy.yml` and RoboTwin's `--overrides` ask for.
 
-    Overrides that RoboTwin could not evaluate arrive as strings, so "false" is false here and "25" a number.
-
     Args:
-        usr_args: `checkpoint`, `execution`, and optionally `temporal_agg`, `cameras`, `image_size`, `device`,
-            `refine_ratio`; RoboTwin adds `left_arm_dim` and `right_arm_dim`.
+        usr_args: `checkpoint`, and what `deployment_of` reads; RoboTwin adds `left_arm_dim` and `right_arm_dim`.
         folder: policy folder, which a relative `checkpoint` is in.
 
     Raises:
@@ -62,15 +60,7 @@ def get_model(usr_args: Mapping[str, Any], folder: Path | None = None) -> Robotw
     Source: RoboTwin-Platform/RoboTwin@13c3c47, policy/Your_Policy and script/eval_policy.py.
     """
     checkpoint = Path(folder or ".") / text(usr_args, "checkpoint")
-    deployment = Deployment(
-        checkpoint,
-        cameras=CAMERAS | _cameras(usr_args.get("cameras")),
-        calibration=CALIBRATION,
-        execution=choose_execution(usr_args.get("execution"), switch(usr_args, "temporal_agg")),
-        image_size=shape(usr_args, "image_size"),
-        device=text(usr_args, "device", "auto"),
-        refine_ratio=number(usr_args, "refine_ratio"),
-    )
+    deployment = deployment_of(usr_args, checkpoint, cameras=CAMERAS, calibration=CALIBRATION)
     if deployment.info.data.get("state") == "measured":
         fix = "Train with `--data.state commanded`: RoboTwin reports the drive targets, not the measured joints."
         raise CheckpointError(checkpoint, "a policy that sees commanded joints", "one that sees measured ones", fix)
@@ -126,13 +116,4 @@ def reset_model(model: RobotwinModel) -> None:
     model.reset_model()
 
 
-def write_policy(checkpoint: Path, out: Path, **options: Any) -> list[Path]:
-    """Write a policy folder for RoboTwin; the options are those of `write_adapter_folder`."""
-    return write_adapter_folder("robotwin", get_model, checkpoint, out, **options)
-
-
-def _cameras(given: Any) -> dict[str, str]:
-    if given is None or (isinstance(given, Mapping) and all(isinstance(name, str) for name in given.values())):
-        return dict(given or {})
-    fix = "Write e.g. {cam_high: head_camera}."
-    raise ConfigError("cameras", "the environment's name of each of the policy's cameras", given, fix)
+write_policy = partial(write_adapter_folder, "robotwin", get_model)

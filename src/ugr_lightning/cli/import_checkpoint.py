@@ -71,15 +71,11 @@ def _import_lerobot(
         image_size: height and width of the images; null takes what `config.json` says.
     """
     from ugr_lightning.bridges.lerobot_policy import import_lerobot
-    from ugr_lightning.models.policy_folder import CONFIG, WEIGHTS, read_json, read_safetensors
 
     _require_new(out)
-    place = Path(folder)
-    config, weights = read_json(place / CONFIG), read_safetensors(place / WEIGHTS)
-    policy, about = import_lerobot(config, weights, place, cameras=cameras, precision=precision)
-    _save(out, policy, {"task": task, "image_size": image_size or about.image_size, "state": "commanded"}, {})
-    print(f"imported    {len(weights)} tensors, none left over")
-    print("\n".join(f"note        {note}" for note in about.notes))
+    policy, size, notes = import_lerobot(Path(folder), cameras=cameras, precision=precision)
+    _save(out, policy, {"task": task, "image_size": image_size or size, "state": "commanded"}, {})
+    print("\n".join(f"note        {note}" for note in notes))
     return 0
 
 

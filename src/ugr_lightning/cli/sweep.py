@@ -90,6 +90,7 @@ class SweepPlan(NamedTuple):
 
 def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[ExecutionName] | None) -> SweepPlan:
     """What is asked for, once it is clear that the policy can do all of it."""
+    from ugr_lightning.bridges.export import made_up_observation
     from ugr_lightning.models.checkpoint import load_policy
     from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.rollout.aggregation import make_execution
@@ -101,7 +102,8 @@ def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[Executi
         with_refine_ratio(policy, ratio)
     trained: Any = getattr(getattr(policy, "refine", None), "ratio", None)
     tried: list[float] = sorted({0.0, trained, *wanted}) if wanted else []
-    certain = _predicts_variance(policy, info.data.get("image_size"))
+    seen = made_up_observation(policy, info.data.get("image_size") or (120, 160), samples=1)
+    certain = policy.predict(seen).log_variance is not None
     first, *others = both_executions(policy)
     weighted: list[ExecutionName] = [VARIANCE] if certain else []
     chosen = executions or [first, *weighted, *others, ADAPTIVE]
@@ -111,19 +113,6 @@ def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[Executi
         fix = "Leave it out, or train with `uncertainty_head: true`."
         raise ConfigError(f"--executions {VARIANCE}", "a policy with a log-variance per step", "one without", fix)
     return SweepPlan(checkpoint, policy, info, trained, tried, list(dict.fromkeys(chosen)))
-
-
-def _predicts_variance(policy: "ChunkPolicy", image_size: Sequence[int] | None) -> bool:
-    """Whether chunks come with a log-variance; asked with an empty observation."""
-    import torch
-
-    from ugr_lightning.contract import Observation
-
-    rows = (1,) if policy.observation_steps == 1 else (1, policy.observation_steps)
-    images = torch.zeros(*rows, len(policy.cameras), 3, *(image_size or (120, 160)), dtype=torch.uint8)
-    with torch.no_grad():
-        chunk = policy.predict(Observation(images, torch.zeros(*rows, policy.state_dim)))
-    return chunk.log_variance is not None
 
 
 def _offline(plan: SweepPlan, data: str, stride: int) -> list[Any]:

@@ -1,6 +1,7 @@
 """The adapter folder that XPolicyLab's scripts expect (XPolicyLab/XPolicyLab@7198143, policy/ACT)."""
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,7 @@ from ugr_lightning.bridges.xpolicylab.model import XPolicyModel
 from ugr_lightning.errors import ConfigError
 
 
-def write_adapter(checkpoint: Path, out: Path, **options: Any) -> list[Path]:
-    """Write an adapter folder for XPolicyLab; the options are those of `write_adapter_folder`."""
-    return write_adapter_folder("xpolicylab", XPolicyModel, checkpoint, out, **options)
+write_adapter = partial(write_adapter_folder, "xpolicylab", XPolicyModel)
 
 
 def read_deployment(folder: Path, overrides: Mapping[str, Any]) -> dict[str, Any]:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ugr_lightning.bridges.deployment import Deployment, Sight
-from ugr_lightning.bridges.options import choose_execution, number, shape, switch, text
+from ugr_lightning.bridges.deployment import Sight
+from ugr_lightning.bridges.options import deployment_of, number, text
 from ugr_lightning.data.storage.jpeg import decode_picture
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
 
@@ -59,8 +59,8 @@ class XPolicyModel:
     observation when only the newest one travels with a request.
 
     Args:
-        model_cfg: of `deploy.yml`: `checkpoint` or `ckpt_name`, `execution`, and optionally `temporal_agg`, `cameras`,
-            `image_size`, `device`, `refine_ratio`, `environments` (how many are remembered).
+        model_cfg: of `deploy.yml`: `checkpoint` or `ckpt_name`, what `deployment_of` reads, and optionally
+            `environments` (how many are remembered).
         folder: the adapter's folder, which relative checkpoints are in.
 
     Raises:
@@ -73,15 +73,9 @@ class XPolicyModel:
             fix = "Evaluate with action_type joint: the policy commands joint targets."
             raise ConfigError("action_type", "joint", model_cfg["action_type"], fix)
         self._count = count = int(number(model_cfg, "environments") or ENVIRONMENTS)
-        self.deployment = Deployment(
-            find_checkpoint(model_cfg, folder or Path()),
-            cameras=CAMERAS | dict(model_cfg.get("cameras") or {}),
-            calibration=CALIBRATION,
-            execution=choose_execution(model_cfg.get("execution"), switch(model_cfg, "temporal_agg")),
-            slots=count,
-            image_size=shape(model_cfg, "image_size"),
-            device=text(model_cfg, "device", "auto"),
-            refine_ratio=number(model_cfg, "refine_ratio"),
+        checkpoint = find_checkpoint(model_cfg, folder or Path())
+        self.deployment = deployment_of(
+            model_cfg, checkpoint, cameras=CAMERAS, calibration=CALIBRATION, slots=count
         )
         self._free = list(reversed(range(count)))
         self._environments: dict[tuple[Hashable, int], Environment] = {}  # least recently used first
