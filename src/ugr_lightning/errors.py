@@ -1,5 +1,6 @@
 """Every error a user can meet: where it happened, what was expected, what was found, and what to do about it."""
 
+import importlib
 import sys
 
 
@@ -49,16 +50,23 @@ class ProtocolError(UGRError):
     """An observation or a message of another program that does not keep to the agreed form."""
 
 
-def missing_extra(where: object, extra: str, cause: ImportError) -> ConfigError:
-    """The error for a package that only some users need.
+def require_extra(where: object, extra: str, *modules: str) -> None:
+    """Make sure that packages are there which only some users need.
 
     Args:
-        where: what needs it.
-        extra: the group of pyproject.toml that brings it.
-        cause: what the import said.
+        where: what needs them.
+        extra: the group of pyproject.toml that brings them.
+        modules: what is imported.
+
+    Raises:
+        ConfigError: one of them is missing.
     """
-    fix = f"Install them with `pip install 'ugr-lightning[{extra}]'`."
-    return ConfigError(where, f"the packages of the extra `{extra}`", f"none ({cause})", fix)
+    try:
+        for module in modules:
+            importlib.import_module(module)
+    except ImportError as error:
+        fix = f"Install them with `pip install 'ugr-lightning[{extra}]'`."
+        raise ConfigError(where, f"the packages of the extra `{extra}`", f"none ({error})", fix) from error
 
 
 def simulator_advice(cause: object = "") -> str:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ugr_lightning.contract import ChunkPolicy, Observation
-from ugr_lightning.errors import ConfigError, missing_extra
+from ugr_lightning.errors import ConfigError, require_extra
 from ugr_lightning.models.diffusion import DiffusionPolicy
 
 Graph = Callable[..., Tensor]
@@ -84,7 +84,7 @@ def export_onnx(policy: ChunkPolicy, observation: Observation, path: Path) -> No
     Raises:
         ConfigError: a policy without such a graph, or the packages of the extra `onnx` are missing.
     """
-    require_onnx()
+    require_extra("--to onnx", "onnx", "onnx", "onnxruntime", "onnxscript")
     program = _trace(policy, observation)
     with _quiet():
         model = torch.onnx.export(
@@ -103,7 +103,6 @@ def export_onnx(policy: ChunkPolicy, observation: Observation, path: Path) -> No
 
 def load_onnx(path: Path) -> Graph:
     """The graph that `export_onnx` has written, in onnxruntime on the CPU."""
-    require_onnx()
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
@@ -115,20 +114,6 @@ def load_onnx(path: Path) -> Graph:
         return torch.from_numpy(session.run(["actions"], given)[0])
 
     return run
-
-
-def require_onnx() -> None:
-    """Make sure that the packages of the extra `onnx` are there.
-
-    Raises:
-        ConfigError: they are not.
-    """
-    try:
-        import onnx  # noqa: F401
-        import onnxruntime  # noqa: F401
-        import onnxscript  # noqa: F401
-    except ImportError as error:
-        raise missing_extra("--to onnx", "onnx", error) from error
 
 
 def _trace(policy: ChunkPolicy, observation: Observation) -> torch.export.ExportedProgram:

@@ -11,7 +11,7 @@ from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.chunks import ChunkDataset
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.storage.cache import open_frames
-from ugr_lightning.errors import ConfigError, missing_extra
+from ugr_lightning.errors import ConfigError, require_extra
 from ugr_lightning.models.checkpoint import TrainingData
 from ugr_lightning.rollout.traces import PredictionTrace
 from ugr_lightning.system.files import publish
@@ -131,11 +131,10 @@ class _Recording:
     """
 
     def __init__(self, name: str, cameras: tuple[str, ...]) -> None:
-        try:
-            import rerun
-            import rerun.blueprint as views
-        except ImportError as error:
-            raise missing_extra("ugr view", "view", error) from error
+        require_extra("ugr view", "view", "rerun.blueprint")
+        import rerun
+        import rerun.blueprint as views
+
         self.rerun = rerun
         self.stream = rerun.RecordingStream("ugr-lightning", recording_id=name)
         pictures = [views.Spatial2DView(origin=f"cameras/{camera}", name=camera) for camera in cameras]

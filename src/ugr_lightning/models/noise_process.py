@@ -6,7 +6,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from ugr_lightning.errors import ConfigError, missing_extra
+from ugr_lightning.errors import ConfigError, require_extra
 
 SamplerName = Literal["ddpm", "ddim"]
 PredictionName = Literal["epsilon", "sample", "v_prediction"]
@@ -37,12 +37,11 @@ class NoiseProcess:
         sampling_steps: int = 100,
         prediction: PredictionName = "epsilon",
     ) -> None:
+        require_extra("Diffusion Policy", "diffusion", "diffusers.schedulers.scheduling_ddim")
         # Imported here: diffusers takes seconds, and the other policies do without it.
-        try:
-            from diffusers.schedulers.scheduling_ddim import DDIMScheduler
-            from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
-        except ImportError as error:
-            raise missing_extra("Diffusion Policy", "diffusion", error) from error
+        from diffusers.schedulers.scheduling_ddim import DDIMScheduler
+        from diffusers.schedulers.scheduling_ddpm import DDPMScheduler
+
         if not 1 <= sampling_steps <= steps:
             fix = "Change `sampling_steps` or `diffusion_steps`."
             raise ConfigError("sampling_steps", f"1 to {steps} (diffusion_steps)", sampling_steps, fix)

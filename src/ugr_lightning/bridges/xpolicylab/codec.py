@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ugr_lightning.errors import ProtocolError, missing_extra
+from ugr_lightning.errors import ProtocolError
 
 BYTES_OF_ENVIRONMENT = 8 * 2**20
 """Of one observation at most; three cameras of 480x640 with depth are 5.5 MB."""
@@ -19,19 +19,6 @@ MAX_ITEMS = 4096
 MAX_AXES = 4
 NUMBERS = re.compile(r"[<>|=]?[biuf][1248]")
 FIX = "Send msgpack maps with numbers, texts and NumPy arrays of numbers."
-
-
-def require_extra() -> None:
-    """Say what to install where the packages of the server are missing.
-
-    Raises:
-        ConfigError: they are missing.
-    """
-    try:
-        import msgpack  # noqa: F401
-        import websockets  # noqa: F401
-    except ImportError as error:
-        raise missing_extra("XPolicyLab", "xpolicylab", error) from error
 
 
 def pack(message: dict[str, Any]) -> bytes:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from types import FrameType, TracebackType
 from typing import Any, Self
 
-from ugr_lightning.bridges.xpolicylab.codec import BYTES_OF_ENVIRONMENT, pack, require_extra, unpack
+from ugr_lightning.bridges.xpolicylab.codec import BYTES_OF_ENVIRONMENT, pack, unpack
 from ugr_lightning.bridges.xpolicylab.messages import (
     CALL_FAILED,
     CLOSE,
@@ -27,7 +27,7 @@ from ugr_lightning.bridges.xpolicylab.messages import (
     read_message,
 )
 from ugr_lightning.bridges.xpolicylab.model import XPolicyModel
-from ugr_lightning.errors import ConfigError, ProtocolError, UGRError
+from ugr_lightning.errors import ConfigError, ProtocolError, UGRError, require_extra
 from ugr_lightning.system.signals import handled
 
 LOOPBACK = "127.0.0.1"
@@ -57,7 +57,7 @@ class PolicyServer:
     """
 
     def __init__(self, model: XPolicyModel, host: str = LOOPBACK, port: int = PORT) -> None:
-        require_extra()
+        require_extra("XPolicyLab", "xpolicylab", "msgpack", "websockets")
         self.model, self.host, self.port = model, host, port
         self.identity = uuid.uuid4().hex  # clients see by it that the server was started anew
         self.most_bytes = BYTES_OF_ENVIRONMENT * model.environments

@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ugr_lightning.errors import ConfigError, missing_extra
+from ugr_lightning.errors import ConfigError, require_extra
 
 
 def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str, Any]) -> int:
@@ -24,10 +24,9 @@ def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str
     Raises:
         ConfigError: submitit is not installed, or does not know an option.
     """
-    try:
-        import submitit
-    except ImportError as error:
-        raise missing_extra("--launcher submitit", "cluster", error) from error
+    require_extra("--launcher submitit", "cluster", "submitit")
+    import submitit
+
     if not commands:
         print("Nothing is left to do.")
         return 0

@@ -10,7 +10,7 @@ from PIL import Image
 
 from ugr_lightning.data.storage.frames import MAX_PIXELS, FrameSource
 from ugr_lightning.data.storage.hdf5 import MAX_COLUMNS
-from ugr_lightning.errors import DataError, missing_extra
+from ugr_lightning.errors import DataError, require_extra
 
 MAX_BYTES = 2**27  # of numbers that are loaded at a time
 MANY = 2**16  # rows of numbers that are decoded at a time
@@ -25,11 +25,9 @@ def import_pyarrow() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import pyarrow
-        import pyarrow.parquet
-    except ImportError as error:
-        raise missing_extra("Parquet files", "lerobot", error) from error
+    require_extra("Parquet files", "lerobot", "pyarrow.parquet")
+    import pyarrow
+
     return pyarrow
 
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ugr_lightning.data.storage.frames import MAX_PIXELS, FrameSource
-from ugr_lightning.errors import DataError, missing_extra
+from ugr_lightning.errors import DataError, require_extra
 
 FIX = "Copy the dataset again, or leave this episode out."
 ENCODING = {"preset": "veryfast", "crf": "18", "g": "2", "bf": "0", "mbtree": "0", "rc-lookahead": "0"}
@@ -26,10 +26,9 @@ def import_av() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    try:
-        import av
-    except ImportError as error:
-        raise missing_extra("video files", "lerobot", error) from error
+    require_extra("video files", "lerobot", "av")
+    import av
+
     return av
 
 
