@@ -19,7 +19,6 @@ from ugr_lightning.bridges.deployment import scaled
 from ugr_lightning.bridges.export import export_policy
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
 from ugr_lightning.rollout.evaluate import run_episodes
-from ugr_lightning.rollout.simulators import Simulators
 from ugr_lightning.rollout.spec import RolloutSpec
 
 SIZE = (30, 40)
@@ -36,19 +35,6 @@ def settings(file, **more):
 
 def fake_environment(size=SIZE):
     return TaskEnv(FakeSimulator("reach", image_size=size))
-
-
-@pytest.fixture(scope="module")
-def rolled_out(fake_tasks):
-    """What our own rollout makes of some seeds, in one process for all tests."""
-    with Simulators() as simulators:
-
-        def roll(policy, seeds, execution):
-            spec = RolloutSpec("reach", seeds, image_size=SIZE, execution=execution, workers=1, progress=False)
-            results = run_episodes(policy.for_inference(), spec, simulators=simulators)
-            return {result.seed: (result.success, result.steps, result.motion_hash) for result in results}
-
-        yield roll
 
 
 @pytest.mark.parametrize(

@@ -29,9 +29,6 @@ from ugr_lightning.data.storage.jpeg import encode_jpeg
 from ugr_lightning.embodiment import image_projection
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
 from ugr_lightning.rollout.actors import PolicyActor
-from ugr_lightning.rollout.evaluate import run_episodes
-from ugr_lightning.rollout.simulators import Simulators
-from ugr_lightning.rollout.spec import RolloutSpec
 
 pytest.importorskip("msgpack", reason="the extra `xpolicylab` is not installed")
 pytest.importorskip("websockets", reason="the extra `xpolicylab` is not installed")
@@ -90,19 +87,6 @@ def vectors(actions):
     return np.stack([joints_of(action) for action in actions])
 
 
-@pytest.fixture(scope="module")
-def rolled_out(fake_tasks):
-    """What our own rollout makes of some seeds, in one process for all tests."""
-    with Simulators() as simulators:
-
-        def roll(policy, seeds, execution):
-            spec = RolloutSpec("reach", seeds, image_size=(30, 40), execution=execution, workers=1, progress=False)
-            results = run_episodes(policy.for_inference(), spec, simulators=simulators)
-            return [(result.success, result.steps, result.motion_hash) for result in results]
-
-        yield roll
-
-
 def fakes(seeds):
     return Environments([FakeSimulator("reach", image_size=(30, 40)) for _ in seeds], seeds)
 
@@ -133,7 +117,7 @@ def adapter(tmp_path, monkeypatch):
 def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, rolled_out, tmp_path, policy, execution):
     seeds, folder = [0, 5, 6, 1], tmp_path / "XPolicyLab" / "policy" / "UGR"
     module = adapter(save(policy, tmp_path / "a.ckpt"), execution=execution, copy=True)
-    expected = rolled_out(policy, seeds, execution)
+    expected = [rolled_out(policy, seeds, execution)[seed] for seed in seeds]
     model, deploy = module("model").Model(read_deployment(folder, {})), module("deploy")
     batch = fakes(seeds)
     deploy.eval_one_episode_batch(batch, Direct(model))

@@ -5,30 +5,18 @@ import subprocess
 import sys
 
 import pytest
-import torch
 import yaml
+from deployed import save, tiny_act
 
 from ugr_lightning.cli.main import main
-from ugr_lightning.models.act import ACT
-from ugr_lightning.models.checkpoint import describe
-
-TINY = {"dim": 16, "feedforward": 32, "heads": 2, "encoder_layers": 1, "decoder_layers": 1, "cvae_layers": 0}
-TINY |= {"backbone_width": 8, "backbone_norm": "batch", "precision": "fp32", "chunk_length": 10}
-
-
-class Data:
-    task, setting, state, image_size = "click_alarmclock", "demo_clean", "commanded", (30, 40)
 
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory):
     """A checkpoint with statistics and one without."""
     folder = tmp_path_factory.mktemp("run")
-    policy = ACT(**TINY)
-    for name in ("unfitted.ckpt", "policy_best.ckpt"):
-        weights = {f"policy.{key}": value for key, value in policy.state_dict().items()}
-        torch.save({"policy": describe(policy, Data()), "state_dict": weights}, folder / name)
-        policy.normalizer.fitted.fill_(True)
+    for name, fitted in (("unfitted.ckpt", False), ("policy_best.ckpt", True)):
+        save(tiny_act(fitted), folder / name)
     return folder
 
 
@@ -56,11 +44,7 @@ def test_a_checkpoint_without_statistics_is_refused_and_nothing_written(checkpoi
     assert not folder.exists()
 
 
-def test_the_evaluators_are_listed_and_a_wrong_name_is_an_error(capsys):
-    with pytest.raises(SystemExit):
-        main(["bridge", "--help"])
-    listed = capsys.readouterr().out
-    assert all(name in listed for name in ("robotwin", "xpolicylab", "serve"))
+def test_a_wrong_name_is_an_error(capsys):
     for wrong in (["bridge"], ["bridge", "robottwin"], ["bridge", "serve"]):
         assert main(wrong) == 2
         assert "ugr bridge" in capsys.readouterr().err

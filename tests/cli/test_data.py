@@ -99,12 +99,3 @@ def test_what_cannot_work_is_one_message_and_exit_code_2(arguments, message, fol
     error = capsys.readouterr().err
     assert message in error
     assert "Traceback" not in error
-
-
-def test_help_names_both_commands(capsys):
-    with pytest.raises(SystemExit) as ended:
-        main(["data", "--help"])
-    assert ended.value.code == 0
-    told = capsys.readouterr().out
-    assert "ugr data inspect" in told
-    assert "ugr data convert" in told

@@ -22,14 +22,6 @@ def test_an_unknown_command_names_the_closest_one(capsys):
     assert "Did you mean `ugr rollout`?" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", sorted(COMMANDS))
-def test_every_command_explains_itself(command, capsys):
-    with pytest.raises(SystemExit) as done:
-        main([command, "--help"])
-    assert done.value.code in (0, None)
-    assert "usage" in capsys.readouterr().out.lower()
-
-
 def test_a_problem_of_the_user_is_one_paragraph_and_a_traceback_only_on_request(monkeypatch, capsys):
     def fail(command, arguments):
         raise DataError("episode0.hdf5", "the key `state`", "no such key", "Record it again.")

@@ -38,13 +38,6 @@ def test_a_report_can_be_made_again_of_the_summary_beside_it(files, tmp_path):
         assert path.read_text() == (tmp_path / "second" / path.name).read_text(), path.name
 
 
-def test_a_broken_line_is_named(files, tmp_path, capsys):
-    with (tmp_path / "base.jsonl").open("a") as file:
-        file.write("{broken\n")
-    assert main(["report", *files]) == 2
-    assert "base.jsonl, line 21" in capsys.readouterr().err
-
-
 def test_results_at_home_are_found_and_a_damaged_config_beside_them_is_named(files, tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("HOME", str(tmp_path))
     for content in ("seed_everything: [1", "- 1\n", "x"):

@@ -50,13 +50,6 @@ def test_a_run_without_episodes_yet_is_there_and_empty(benchmark):
     assert read_benchmark(benchmark)[0].results == []
 
 
-def test_a_broken_line_is_named(benchmark):
-    path = benchmark / "results" / "base" / "results.jsonl"
-    path.write_text(path.read_text() + '{"task": "cl\n')
-    with pytest.raises(DataError, match=r"results.jsonl, line 3"):
-        read_benchmark(benchmark)
-
-
 def test_episodes_of_another_checkpoint_are_not_mixed_in(benchmark):
     write(benchmark / "results" / "base" / "results.jsonl", [1], checkpoint="other", execution="25")
     with pytest.raises(DataError, match="other"):

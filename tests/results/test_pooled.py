@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-from scipy.stats import false_discovery_control, permutation_test
+from scipy.stats import permutation_test
 
 from ugr_lightning.results.pooled import hierarchical_bootstrap, holm, sign_flip_test
 from ugr_lightning.results.stats import mcnemar
@@ -12,13 +12,6 @@ def test_holm_gives_the_textbook_values():
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02], abs=1e-15)
     assert holm([]) == []
     assert holm([0.7, 0.9]) == [1.0, 1.0]
-
-
-def test_holm_is_never_milder_than_the_control_of_the_false_discovery_rate():
-    rng = np.random.default_rng(0)
-    for _ in range(100):
-        p = rng.uniform(size=7) ** 3
-        assert np.all(np.array(holm(p)) >= false_discovery_control(p) - 1e-12)
 
 
 def test_holm_agrees_with_statsmodels():
@@ -38,17 +31,8 @@ def test_a_sign_flip_test_counts_every_pattern_of_signs():
     rng = np.random.default_rng(2)
     for _ in range(10):
         differences = rng.integers(-3, 4, size=8)
-        sums = [abs(np.dot(signs, differences)) for signs in itertools.product((-1, 1), repeat=8)]
-        assert sign_flip_test(differences) == pytest.approx(
-            np.mean(np.array(sums) >= abs(differences.sum())), abs=1e-12
-        )
         scipys = permutation_test((differences,), np.sum, permutation_type="samples", n_resamples=np.inf).pvalue
         assert sign_flip_test(differences) == pytest.approx(scipys, abs=1e-12)
-
-
-def test_repeating_every_seed_with_another_training_seed_adds_no_evidence_when_nothing_varies():
-    assert sign_flip_test([2] * 6 + [-2]) == sign_flip_test([1] * 6 + [-1])
-    assert mcnemar(12, 2) < sign_flip_test([2] * 6 + [-2])
 
 
 def test_a_bootstrap_over_one_training_seed_has_the_spread_of_the_paired_difference():

@@ -39,14 +39,6 @@ def test_disagreement_is_the_distance_to_what_earlier_chunks_said_of_the_same_mo
     assert not np.isnan(found[2, :4]).any()
 
 
-def test_chunks_that_agree_have_no_disagreement():
-    motion = np.cumsum(np.random.default_rng(1).normal(size=(20, A)), axis=0)
-    step = np.arange(0, 14, 3)
-    chunks = np.stack([motion[t : t + K] for t in step])
-    found = disagreement(chunks, np.zeros(len(step), int), step)
-    assert np.nanmax(found) == 0
-
-
 def test_sampled_deviation_recovers_the_scatter_of_the_predictions_in_units_of_the_data():
     std = torch.tensor([0.5, 1.0, 2.0])
     frames = SimpleNamespace(of=lambda episodes, stride: np.arange(20))
