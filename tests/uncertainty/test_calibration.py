@@ -73,19 +73,9 @@ def test_recall_counts_the_common_steps(arrays):
     assert np.all(kit.recall(error, error, 4) == 1)
 
 
-def test_captured_error_is_one_for_the_oracle_and_less_for_anything_else(arrays):
-    error, score = arrays
-    assert np.allclose(kit.captured(error, error, 4), 1)
-    found = kit.captured(error, score, 4)
-    assert (found <= 1).all()
-    order = np.argsort(-score[1], kind="stable")[:4]
-    assert found[1] == pytest.approx(error[1, order].sum() / np.sort(error[1])[-4:].sum())
-
-
 def test_a_sample_without_known_steps_has_no_recall():
     nothing = np.full((1, 5), np.nan)
     assert np.isnan(kit.recall(nothing, np.zeros((1, 5)), 2)).all()
-    assert np.isnan(kit.captured(nothing, np.zeros((1, 5)), 2)).all()
 
 
 def test_sparsification_removes_the_highest_scores_first(arrays):

@@ -112,19 +112,6 @@ def recall(error: np.ndarray, score: np.ndarray, budget: int) -> np.ndarray:
     return np.divide(found, worst.sum(1), out=np.full(len(error), np.nan), where=known.any(1))
 
 
-def captured(error: np.ndarray, score: np.ndarray, budget: int) -> np.ndarray:
-    """Error in the steps that the score chooses, relative to that in the worst ones; 1 is the oracle's.
-
-    Kinder than `recall` where several steps are almost equally bad. Arguments and result as there.
-    """
-    known = ~np.isnan(error)
-    filled = np.where(known, error, 0.0)
-    worst = (filled * choose(error, known, budget)).sum(1)
-    return np.divide(
-        (filled * choose(score, known, budget)).sum(1), worst, out=np.full(len(error), np.nan), where=worst > 0
-    )
-
-
 def sparsification(error: np.ndarray, score: np.ndarray, fractions: np.ndarray = FRACTIONS) -> np.ndarray:
     """Mean error of what remains when the steps with the highest scores are left out, relative to that of all.
 

@@ -59,10 +59,7 @@ def compare_with_prior(validation: Predictions, training: Predictions, budget: i
     prior = np.broadcast_to(kit.position_mean(training.coarse), error.shape)  # (n, K)
     by_position = np.log(kit.position_mean(np.square(training.coarse)))  # (K,)
     constant = np.log(np.nanmean(np.square(training.coarse)))
-    per_chunk = {  # none of these depends on the other chunks
-        name: np.stack([of(error, score, budget) for score in (learned, prior)])
-        for name, of in ((RECALL, kit.recall), ("error captured, share of the oracle's", kit.captured))
-    }
+    recalls = np.stack([kit.recall(error, score, budget) for score in (learned, prior)])  # (2, n)
     scaled = [variance + _scale(error, variance) for variance in (learned, by_position, constant)]
     nll = np.stack([kit.gaussian_nll(error, variance) for variance in (learned, by_position, constant)])  # (3, n, K)
     nll_scaled = np.stack([kit.gaussian_nll(error, variance) for variance in scaled])  # (3, n, K)
@@ -73,7 +70,7 @@ def compare_with_prior(validation: Predictions, training: Predictions, budget: i
         pairs = [
             (kit.spearman(e, s), kit.spearman(e, p)),
             (kit.spearman_within_position(e, s), np.nan),
-            *(np.nanmean(values[:, rows], axis=1) for values in per_chunk.values()),
+            np.nanmean(recalls[:, rows], axis=1),
             (kit.ause(e, s), kit.ause(e, p)),
             *((np.nanmean(values[0, rows]), np.nanmean(values[1, rows])) for values in (nll, nll_scaled)),
         ]
@@ -82,10 +79,10 @@ def compare_with_prior(validation: Predictions, training: Predictions, budget: i
 
     found = kit.bootstrap(statistics, validation.episode, resamples)
     ceiling = kit.sparsification(error, error)
-    chance = [0.0, 0.0, share, _captured_by_chance(error, budget), float(np.trapezoid(1 - ceiling, kit.FRACTIONS))]
+    chance = [0.0, 0.0, share, float(np.trapezoid(1 - ceiling, kit.FRACTIONS))]
     chance += [float(np.nanmean(nll[2])), float(np.nanmean(nll_scaled[2]))]
-    names = ["Spearman with the error", WITHIN, *per_chunk, "AUSE", "NLL, nats", "NLL, scale corrected"]
-    better = ["higher"] * 4 + ["lower"] * 3
+    names = ["Spearman with the error", WITHIN, RECALL, "AUSE", "NLL, nats", "NLL, scale corrected"]
+    better = ["higher"] * 3 + ["lower"] * 3
     return [
         Row(name, direction, found[3 * i], found[3 * i + 1], chance[i], found[3 * i + 2])
         for i, (name, direction) in enumerate(zip(names, better, strict=True))
@@ -95,13 +92,6 @@ def compare_with_prior(validation: Predictions, training: Predictions, budget: i
 def _scale(error: np.ndarray, log_variance: np.ndarray | float) -> float:
     """The one constant on all log-variances that fits these errors best."""
     return float(np.log(np.nanmean(np.square(error) * np.exp(-np.asarray(log_variance)))))
-
-
-def _captured_by_chance(error: np.ndarray, budget: int) -> float:
-    known = ~np.isnan(error)
-    worst = np.where(kit.choose(error, known, budget), error, 0.0).sum(1)
-    chance = np.nansum(error, axis=1) * np.minimum(1.0, budget / known.sum(1))
-    return float(np.mean(chance / worst))
 
 
 def calibration_verdict(rows: list[Row], episodes: int, budget: int) -> str:
