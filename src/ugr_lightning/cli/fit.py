@@ -22,7 +22,7 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ugr_lightning.cli.failures import explain_training
 from ugr_lightning.cli.parsing.call import at_home
-from ugr_lightning.cli.parsing.config import expand_includes, explain, run_name
+from ugr_lightning.cli.parsing.config import expand_includes, explain, flat, run_name
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.errors import CheckpointError, UGRError
 from ugr_lightning.models.checkpoint import read_checkpoint
@@ -72,7 +72,7 @@ class RunRecord(SaveConfigCallback):
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the hyper-parameters with success as a metric, where there were rollouts."""
-        values = _flat(yaml.safe_load(self.parser.dump(self.config, skip_none=False)))
+        values = _by_key(self.parser, self.config)
         scores = {f"hp/{name}": trainer.callback_metrics[name] for name in _SCORES if name in trainer.callback_metrics}
         for logger in trainer.loggers:
             if isinstance(logger, TensorBoardLogger):
@@ -93,14 +93,10 @@ def anywhere(config: Namespace) -> Namespace:
     return config
 
 
-def _flat(tree: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        if isinstance(value, dict):
-            flat |= _flat(value, f"{prefix}{name}.")
-        else:
-            flat[prefix + name] = value if isinstance(value, (bool, int, float, str)) else str(value)
-    return flat
+def _by_key(parser: LightningArgumentParser, config: Namespace) -> dict[str, Any]:
+    """A config by dotted key; what is no number and no text, as text."""
+    values = flat(yaml.safe_load(parser.dump(config, skip_none=False)))
+    return {key: value if isinstance(value, (bool, int, float, str)) else str(value) for key, value in values.items()}
 
 
 class UGRCLI(LightningCLI):
@@ -275,8 +271,7 @@ class UGRCLI(LightningCLI):
 
     def _values(self) -> dict[str, Any]:
         """The resolved config by dotted key."""
-        parser = self._parser(self.subcommand)
-        return _flat(yaml.safe_load(parser.dump(self.config[self.subcommand], skip_none=False)))
+        return _by_key(self._parser(self.subcommand), self.config[self.subcommand])
 
     def after_instantiate_classes(self) -> None:
         """Let the data module record what is missing, with the simulator's help."""
@@ -319,12 +314,9 @@ def run(command: str, argv: Sequence[str]) -> int:
     Raises:
         ConfigError: an unknown key or a value that does not fit.
     """
-    warnings.filterwarnings("ignore", message=".*does not have many workers.*")
-    warnings.filterwarnings("ignore", message=".*smaller than the logging interval.*")
-    warnings.filterwarnings(
-        "ignore", message=".*exists and is not empty.*"
-    )  # the log of a resumed run; it is continued
-    warnings.filterwarnings("ignore", message=".*isinstance.treespec, LeafSpec.*")
+    for remark in ("does not have many workers", "smaller than the logging interval", "isinstance.treespec, LeafSpec"):
+        warnings.filterwarnings("ignore", message=f".*{remark}.*")
+    warnings.filterwarnings("ignore", message=".*exists and is not empty.*")  # the log that a resumed run continues
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(usable_cores())

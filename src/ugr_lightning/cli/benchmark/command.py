@@ -1,5 +1,6 @@
 """`ugr benchmark`: train and evaluate a grid, one job after another, going on wherever it was stopped."""
 
+import csv
 import hashlib
 import sys
 import time
@@ -10,7 +11,7 @@ from typing import Any, Literal, NamedTuple
 
 import yaml
 
-from ugr_lightning.cli.benchmark.grid import Grid, Job, fingerprint, flat, read_grid, resolved_config
+from ugr_lightning.cli.benchmark.grid import Grid, Job, fingerprint, identity, read_grid, resolved_config
 from ugr_lightning.cli.benchmark.subprocesses import Failure, run_and_watch
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import ConfigError, UGRError
@@ -59,7 +60,7 @@ def _benchmark(
         return launch([[*command, str(item.index)] for item in left], folder / "submitit", launcher_options)
     with locked(folder / "benchmark.lock", str(folder), shared=job is not None) as lock:
         if job is None:
-            _copy(Path(grid), folder / "results" / "grid.yaml")
+            publish_text(folder / "results" / "grid.yaml", Path(grid).read_text())
         return Benchmark(plan, folder, chosen, configs, lock).run()
 
 
@@ -121,12 +122,9 @@ def trained_steps(run: Path) -> int:
     for version in reversed(versions_of(run)):
         log = version / "metrics.csv"
         if log.is_file():
-            head, *rows = log.read_text().splitlines() or [""]
-            column = head.split(",").index("step") if "step" in head.split(",") else -1
-            cells = [row.split(",") for row in rows]
-            return max(
-                (int(row[column]) for row in cells if len(row) > column >= 0 and row[column].isdigit()), default=0
-            )
+            with log.open(newline="") as file:
+                steps = [row["step"] or "" for row in csv.DictReader(file) if "step" in row]
+            return max((int(step) for step in steps if step.isdigit()), default=0)
     return 0
 
 
@@ -255,12 +253,8 @@ def _require_same(path: Path, before: dict[str, Any], now: dict[str, Any]) -> No
     Raises:
         ConfigError: names the keys that differ.
     """
-    old, new = flat(before), flat(now)
+    old, new = identity(before), identity(now)
     changed = [f"{key}: {value} before, {new.get(key)} now" for key, value in old.items() if new.get(key) != value]
     if changed:
         fix = "Choose another --out, or undo the change."
         raise ConfigError(path, "the config that this job began with", "; ".join(changed[:5]), fix)
-
-
-def _copy(source: Path, target: Path) -> None:
-    publish_text(target, source.read_text())

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import yaml
 
-from ugr_lightning.cli.parsing.config import find_config
+from ugr_lightning.cli.parsing.config import find_config, flat
 from ugr_lightning.errors import ConfigError
 
 Execution = str | int
@@ -138,21 +138,12 @@ def resolved_config(job: Job) -> dict[str, Any]:
 
 def fingerprint(config: Mapping[str, Any]) -> str:
     """SHA-256 (hex) of a resolved config, without where its run is kept."""
-    return hashlib.sha256(json.dumps(flat(config), sort_keys=True).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(identity(config), sort_keys=True).encode()).hexdigest()
 
 
-def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key, without the keys that say where a run is."""
-    values: dict[str, Any] = {}
-    for name, value in tree.items():
-        key = f"{prefix}{name}"
-        if key in WHERE_ONLY:
-            continue
-        if isinstance(value, Mapping) and value:
-            values |= flat(value, f"{key}.")
-        else:
-            values[key] = value
-    return values
+def identity(config: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of a resolved config by dotted key, without the keys that say where a run is."""
+    return {key: value for key, value in flat(config).items() if key not in WHERE_ONLY}
 
 
 def _mapping(path: Path, name: str, value: Any) -> dict[str, Any]:
@@ -169,14 +160,11 @@ def _refuse_unknown(where: object, entries: Mapping[str, Any], known: set[str]) 
 
 
 def _paths(path: Path, name: str, value: Any) -> tuple[Path, ...]:
-    found = []
-    for item in _listed(value):
-        found.append(find_config(str(item), f"{path}: {name}", path.parent))
-    return tuple(found)
+    return tuple(find_config(str(item), f"{path}: {name}", path.parent) for item in _listed(value))
 
 
 def _policies(path: Path, name: str, value: Any) -> dict[str, tuple[tuple[Path, ...], dict[str, Execution] | None]]:
-    found: dict[str, tuple[tuple[Path, ...], dict[str, Execution] | None]] = {}
+    found = {}
     for policy, entry in _mapping(path, name, value).items():
         where = f"{name}.{policy}"
         entry = entry if isinstance(entry, dict) else {"configs": entry}

@@ -4,8 +4,9 @@ import difflib
 import importlib
 import inspect
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import yaml
 from jsonargparse import ArgumentParser
@@ -91,6 +92,14 @@ def _includes(path: Path) -> list[str]:
         raise ConfigError(path, "a mapping of keys to values", type(content).__name__, "Correct the file.")
     included = content.get("include") or []
     return [included] if isinstance(included, str) else list(included)
+
+
+def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    """The values of nested mappings by dotted key."""
+    values: dict[str, Any] = {}
+    for name, value in tree.items():
+        values |= flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
+    return values
 
 
 def run_name(argv: Sequence[str]) -> str:
