@@ -1,5 +1,6 @@
 """The adapter for XPolicyLab: its model, and its server over real sockets."""
 
+import asyncio
 import gc
 import importlib
 import resource
@@ -48,6 +49,7 @@ from xpolicylab_client import (
     joints_of,
     observation,
     request,
+    served,
 )
 
 from ugr_lightning.bridges.xpolicylab.server import PolicyServer
@@ -61,7 +63,7 @@ def reacher(tmp_path_factory):
 
 
 def serve(checkpoint, **config):
-    return PolicyServer(XPolicyModel({"checkpoint": str(checkpoint), **config}), port=0)
+    return served(XPolicyModel({"checkpoint": str(checkpoint), **config}))
 
 
 def seen(environment, step, size=SIZE):
@@ -122,7 +124,7 @@ def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, rolled_out, tmp_p
     batch = fakes(seeds)
     deploy.eval_one_episode_batch(batch, Direct(model))
     assert batch.outcomes() == expected, "all at once"
-    with PolicyServer(module("model").Model(read_deployment(folder, {})), port=0) as server:
+    with served(module("model").Model(read_deployment(folder, {}))) as server:
         for kind in (Client, AugustClient):
             client = kind(server.url)
             for seed, outcome in zip(seeds, expected, strict=True):
@@ -423,7 +425,7 @@ def test_a_failure_inside_the_policy_is_told_without_its_traceback(reacher, monk
 
 def test_a_port_that_is_taken_is_an_error_that_says_so(reacher):
     with serve(reacher) as server, pytest.raises(ConfigError, match=str(server.port)):
-        PolicyServer(server.model, port=server.port).__enter__()
+        asyncio.run(PolicyServer(server.model, port=server.port).serve(print))
 
 
 def test_a_resent_request_moves_nothing_on(reacher):

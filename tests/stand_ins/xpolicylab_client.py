@@ -1,11 +1,37 @@
 """A stand-in for XPolicyLab's side: its client over a real websocket, its environments and its evaluation loop."""
 
+import asyncio
+import contextlib
+import threading
 import uuid
 
 import msgpack
 import numpy as np
 from robotwin_environment import TaskEnv
 from websockets.sync.client import connect
+
+from ugr_lightning.bridges.xpolicylab.server import PolicyServer
+
+
+@contextlib.contextmanager
+def served(model):
+    """A policy server in a thread of its own, until the block ends."""
+    server, loop, started = PolicyServer(model, port=0), asyncio.new_event_loop(), threading.Event()
+    task = loop.create_task(server.serve(lambda _: started.set()))
+
+    def run():
+        with contextlib.suppress(asyncio.CancelledError):
+            loop.run_until_complete(task)
+
+    thread = threading.Thread(target=run)
+    thread.start()
+    try:
+        assert started.wait(60)
+        yield server
+    finally:
+        loop.call_soon_threadsafe(task.cancel)
+        thread.join()
+        loop.close()
 
 
 def array_to_map(value):

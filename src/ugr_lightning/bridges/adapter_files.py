@@ -15,20 +15,8 @@ MARK = "Written by `ugr bridge"
 """Every file of ours contains it; other files are left alone."""
 
 
-def write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Path]:
-    """Fill in the files of a template.
-
-    Args:
-        template: folder under `templates`; its files are called like the written ones, with `.txt` behind.
-        out: where to; existing files of ours are replaced.
-        values: what takes the place of `@NAME@`.
-
-    Returns:
-        The files written.
-
-    Raises:
-        ConfigError: one of the files exists and is not ours, or the folder cannot be written.
-    """
+def _write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Path]:
+    """Fill `@NAME@` in the files of a template, which are called like the written ones, with `.txt` behind."""
     contents: dict[Path, str] = {}
     for source in sorted(files("ugr_lightning.bridges").joinpath("templates", template).iterdir(), key=str):
         body = source.read_text(encoding="utf-8")
@@ -58,7 +46,7 @@ def write_adapter_folder(
     """Write a policy folder for another program, after loading the checkpoint as that program will.
 
     Args:
-        template: see `write_folder`.
+        template: folder under `templates`.
         load: makes the model from the folder's settings; it has a `deployment`.
         checkpoint: file from `ugr fit`, or the folder of `ugr export --to safetensors`.
         out: the folder, `policy/NAME` of a checkout of the other program.
@@ -70,10 +58,12 @@ def write_adapter_folder(
         The files written.
 
     Raises:
-        ConfigError: the folder holds something else, or its name cannot be imported.
+        ConfigError: a file in it is not ours, it cannot be written, or its name cannot be imported.
         CheckpointError: the checkpoint cannot be evaluated.
     """
-    require_module_name(out)
+    if not out.name.isidentifier():
+        fix = "It is imported by its name; use e.g. policy/UGR."
+        raise ConfigError("--out", "a folder named like a Python module", out.name, fix)
     settings = {"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": dict(cameras or {})}
     used = load(settings).deployment.cameras
     named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in used.items())
@@ -85,7 +75,7 @@ def _place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mappin
     """Write a folder that knows where its checkpoint is: `@CHECKPOINT@` in the template."""
     place = out / (checkpoint.name if checkpoint.is_dir() else "policy_best.ckpt") if copy else checkpoint.resolve()
     named = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
-    written = write_folder(template, out, {**values, "CHECKPOINT": named})
+    written = _write_folder(template, out, {**values, "CHECKPOINT": named})
     if not copy:
         return written
     if checkpoint.is_dir():
@@ -98,14 +88,3 @@ def _place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mappin
     else:
         publish(place, lambda aside: shutil.copyfile(checkpoint, aside))
     return [*written, place]
-
-
-def require_module_name(out: Path) -> None:
-    """Refuse a folder that could not be imported by its name.
-
-    Raises:
-        ConfigError: its name is none of a Python module.
-    """
-    if not out.name.isidentifier():
-        fix = "It is imported by its name; use e.g. policy/UGR."
-        raise ConfigError("--out", "a folder named like a Python module", out.name, fix)

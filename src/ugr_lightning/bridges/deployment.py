@@ -75,7 +75,9 @@ class Deployment:
         refine_ratio: float | None = None,
     ) -> None:
         policy, self.info = load_policy(checkpoint)
-        require_statistics(policy, checkpoint)
+        if not all(module.fitted for module in policy.modules() if isinstance(module, Normalizer)):
+            fix = "Use a checkpoint that was written after training began; `ugr inspect` shows its statistics."
+            raise CheckpointError(checkpoint, "normalisation statistics", "none", fix)
         self.cameras, self.calibration = _named(policy, cameras), calibration
         self.image_size = _size(image_size or self.info.data.get("image_size"), checkpoint)
         self.state_dim, self.action_dim, self.chunk_length = policy.state_dim, policy.action_dim, policy.chunk_length
@@ -163,17 +165,6 @@ class Deployment:
         commands = {slot: self._planned[slot][:steps] for slot in seen}  # (n, A)
         self._planned |= {slot: self._planned[slot][steps:] for slot in seen}
         return commands
-
-
-def require_statistics(policy: ChunkPolicy, checkpoint: Path | str) -> None:
-    """Refuse a policy that would act un-normalised.
-
-    Raises:
-        CheckpointError: its normalisation was never fitted.
-    """
-    if not all(module.fitted for module in policy.modules() if isinstance(module, Normalizer)):
-        fix = "Use a checkpoint that was written after training began; `ugr inspect` shows its statistics."
-        raise CheckpointError(checkpoint, "normalisation statistics", "none", fix)
 
 
 def scaled(picture: Any, size: tuple[int, int], name: str = "picture") -> np.ndarray:

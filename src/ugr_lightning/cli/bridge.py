@@ -120,10 +120,7 @@ def _serve(
     model = XPolicyModel(config, None if folder is None else Path(folder).resolve())
     print(f"policy: {model.deployment}", flush=True)
     server = PolicyServer(model, host, port)
-    number = asyncio.run(server.serve(lambda url: print(f"listening on {url}", flush=True)))
-    if number is not None:
-        raise Stopped(number)
-    return 0
+    raise Stopped(asyncio.run(server.serve(lambda url: print(f"listening on {url}", flush=True))))
 
 
 FUNCTIONS: dict[str, tuple[Callable[..., int], tuple[str, ...]]] = {

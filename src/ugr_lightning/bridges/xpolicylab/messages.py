@@ -18,9 +18,6 @@ REPLIES = {
 }
 """What each request is answered with."""
 CLOSE = "close"
-ERROR = "error"
-INVALID_FRAME, UNKNOWN_TYPE = "invalid_frame", "unknown_message_type"
-INFER_FAILED, RESET_FAILED, CALL_FAILED, INTERNAL = "infer_failed", "reset_failed", "call_failed", "internal"
 LONGEST_NAME = 256
 FIX = "Keep to the envelope of XPolicyLab's websocket protocol."
 

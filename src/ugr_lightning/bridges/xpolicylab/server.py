@@ -3,36 +3,24 @@
 import asyncio
 import logging
 import signal
-import threading
 import time
 import uuid
 from collections.abc import Callable, Hashable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from types import FrameType, TracebackType
-from typing import Any, Self
+from types import FrameType
+from typing import Any
 
 from ugr_lightning.bridges.xpolicylab.codec import BYTES_OF_ENVIRONMENT, pack, unpack
-from ugr_lightning.bridges.xpolicylab.messages import (
-    CALL_FAILED,
-    CLOSE,
-    ERROR,
-    INFER_FAILED,
-    INTERNAL,
-    INVALID_FRAME,
-    REPLIES,
-    RESET_FAILED,
-    UNKNOWN_TYPE,
-    Message,
-    read_message,
-)
+from ugr_lightning.bridges.xpolicylab.messages import CLOSE, REPLIES, Message, read_message
 from ugr_lightning.bridges.xpolicylab.model import XPolicyModel
 from ugr_lightning.errors import ConfigError, ProtocolError, UGRError, require_extra
 from ugr_lightning.system.signals import handled
 
 LOOPBACK = "127.0.0.1"
 PORT = 19000
-FAILURES = {"infer": INFER_FAILED, "reset": RESET_FAILED, "call": CALL_FAILED}
+FAILURES = {"infer": "infer_failed", "reset": "reset_failed", "call": "call_failed"}
+INTERNAL, INVALID_FRAME = "internal", "invalid_frame"
 FUNCTIONS = ("update_obs", "get_action", "update_obs_batch", "get_action_batch", "infer", "reset", "prepare_case")
 """What a `call` may ask for; `on_trial_end` and `trial_end` besides."""
 REMEMBERED, REMEMBERED_BYTES = 256, 16 * 2**20  # replies that are kept for requests that are sent again
@@ -40,7 +28,7 @@ logger = logging.getLogger(__name__)
 
 
 class PolicyServer:
-    """Answers XPolicyLab's requests with a model; a context manager that serves in a thread of its own.
+    """Answers XPolicyLab's requests with a model.
 
     Speaks what XPolicyLab's clients sent until July 2026 (`infer`, with the observation) and since (`call`, a function
     of the model by name; all environments in one message). One request is computed at a time. A client is known by
@@ -63,66 +51,32 @@ class PolicyServer:
         self.most_bytes = BYTES_OF_ENVIRONMENT * model.environments
         self._compute = ThreadPoolExecutor(1, "policy")  # one request at a time, and off the event loop
         self._answered: dict[str, tuple[Message, bytes]] = {}  # envelopes and replies; oldest first
-        self._thread: threading.Thread | None = None
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._stop: asyncio.Event | None = None
 
     @property
     def url(self) -> str:
         """Where clients connect to."""
         return f"ws://{self.host}:{self.port}"
 
-    def __enter__(self) -> Self:
-        """Serve in a thread until the block ends."""
-        started = threading.Event()
-        failure: list[BaseException] = []
-
-        def serve() -> None:
-            try:
-                asyncio.run(self.serve(lambda _: started.set()))
-            except BaseException as error:
-                failure.append(error)
-            finally:
-                started.set()
-
-        self._thread = threading.Thread(target=serve, name="policy server", daemon=True)
-        self._thread.start()
-        started.wait()
-        if failure:
-            raise failure[0]
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        assert self._loop is not None
-        assert self._stop is not None
-        assert self._thread is not None
-        self._loop.call_soon_threadsafe(self._stop.set)
-        self._thread.join()
-        self._compute.shutdown()
-
-    async def serve(self, started: Callable[[str], None]) -> signal.Signals | None:
-        """Serve until a signal asks to end.
+    async def serve(self, started: Callable[[str], None]) -> signal.Signals:
+        """Serve until a signal asks to end, or until it is cancelled.
 
         Args:
             started: called with the url as soon as clients can connect.
 
         Returns:
-            The signal; None where another thread has ended it.
+            The signal.
 
         Raises:
             ConfigError: the address cannot be listened on.
         """
         from websockets.asyncio.server import serve
 
-        self._loop = loop = asyncio.get_running_loop()
-        self._stop = stop = asyncio.Event()
-        signals: list[signal.Signals] = []
+        loop = asyncio.get_running_loop()
+        ended, signals = asyncio.Event(), list[signal.Signals]()
 
         def end(number: int, frame: FrameType | None) -> None:  # not in the midst of an answer, as raising would be
             signals.append(signal.Signals(number))
-            loop.call_soon_threadsafe(stop.set)
+            loop.call_soon_threadsafe(ended.set)
 
         try:
             server = await serve(
@@ -131,12 +85,12 @@ class PolicyServer:
         except OSError as error:
             fix = "Choose another port, or 0 for a free one."
             raise ConfigError("address", "one to listen on", f"{self.url} ({error.strerror})", fix) from error
-        with handled(end):
+        with self._compute, handled(end):
             async with server:
                 self.port = next(iter(server.sockets)).getsockname()[1]
                 started(self.url)
-                await stop.wait()
-        return signals[0] if signals else None
+                await ended.wait()
+        return signals[0]
 
     async def _talk(self, connection: Any) -> None:
         """One request after the other, each answered before the next is read."""
@@ -175,7 +129,7 @@ class PolicyServer:
     def _answer_once(self, frame: Message, client: Hashable) -> bytes:
         """The reply to a request; the same again, without computing it again, where the request is."""
         if frame.message_type not in REPLIES:
-            return pack(_error(frame, UNKNOWN_TYPE, f"requests are {', '.join(REPLIES)} and {CLOSE}").to_message())
+            return pack(_error(frame, "unknown_message_type", f"requests are {', '.join(REPLIES)} and {CLOSE}").to_message())
         envelope = replace(frame, payload={})
         if frame.message_id in self._answered:
             known, reply = self._answered[frame.message_id]
@@ -248,4 +202,4 @@ def _refusal(content: Mapping[str, Any], error: ProtocolError) -> Message:
 
 
 def _error(frame: Message, code: str, message: str) -> Message:
-    return frame.reply(ERROR, {"code": code, "message": message[:1000], "details": {}})
+    return frame.reply("error", {"code": code, "message": message[:1000], "details": {}})
