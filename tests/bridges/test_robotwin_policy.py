@@ -73,26 +73,6 @@ def test_our_simulator_driven_through_robotwins_interface_moves_as_in_a_rollout(
     assert outcomes == {result.seed: (result.success, result.steps, result.motion_hash) for result in results}
 
 
-def test_an_episode_is_the_same_whatever_ran_before(reacher):
-    model = robotwin.get_model(settings(reacher))
-    first = evaluate(robotwin, model, fake_environment(), [5, 0, 5])
-    again = evaluate(robotwin, robotwin.get_model(settings(reacher)), fake_environment(), [5])
-    assert first[5] == again[5]
-    assert first[5][0], "and it succeeds"
-
-
-def test_without_a_reset_the_averages_of_the_last_episode_would_show(reacher):
-    class Forgetful:
-        eval = staticmethod(robotwin.eval)
-
-        def reset_model(self, model):
-            pass
-
-    model = robotwin.get_model(settings(reacher))
-    first = evaluate(Forgetful(), model, fake_environment(), [5])
-    assert evaluate(Forgetful(), model, fake_environment(), [5]) != first
-
-
 def test_what_is_left_of_a_chunk_after_success_is_ignored_and_no_action_exceeds_the_limit(reacher):
     model, environment = robotwin.get_model(settings(reacher, execution=5)), fake_environment()
     success, steps, _ = evaluate(robotwin, model, environment, [0])[0]
@@ -224,19 +204,14 @@ def test_an_exported_folder_is_a_checkpoint_too_and_can_be_copied(tmp_path, monk
     assert outcomes[0] == outcomes[1]
 
 
-def test_the_scripts_of_the_folder_are_valid_and_say_how_to_call_them(reacher, tmp_path):
-    folder = tmp_path / "UGR"
+def test_the_scripts_say_how_to_call_them_and_start_robotwins_evaluation_with_its_overrides(reacher, tmp_path):
+    folder = tmp_path / "policy" / "UGR"
     robotwin.write_policy(reacher, folder)
     for script in folder.glob("*.sh"):
         assert subprocess.run(["bash", "-n", script], check=False).returncode == 0
         called = subprocess.run(["bash", script], capture_output=True, text=True, check=False)
         assert called.returncode == 2
         assert script.name in called.stderr
-
-
-def test_the_script_starts_robotwins_evaluation_with_its_overrides(reacher, tmp_path):
-    folder = tmp_path / "policy" / "UGR"
-    robotwin.write_policy(reacher, folder)
     (tmp_path / "script").mkdir()
     (tmp_path / "script" / "eval_policy.py").write_text("import json, sys; print(json.dumps(sys.argv[1:]))")
     path = {"PATH": f"{Path(sys.executable).parent}:/usr/bin:/bin"}

@@ -6,7 +6,6 @@ import importlib
 import resource
 import subprocess
 import sys
-import threading
 import tracemalloc
 import types
 from concurrent.futures import ThreadPoolExecutor
@@ -23,7 +22,6 @@ from fake_simulator import HOME, FakeSimulator
 from ugr_lightning.bridges.deployment import Deployment, Sight, scaled
 from ugr_lightning.bridges.xpolicylab import codec
 from ugr_lightning.bridges.xpolicylab.adapter import read_deployment, write_adapter
-from ugr_lightning.bridges.xpolicylab.messages import read_message
 from ugr_lightning.bridges.xpolicylab.model import CAMERAS, XPolicyModel, find_checkpoint, read_observation
 from ugr_lightning.contract import Statistics
 from ugr_lightning.data.storage.jpeg import encode_jpeg
@@ -406,6 +404,7 @@ def test_every_kind_of_request_gets_the_reply_of_its_name(reacher):
         assert client.ask("trial_end", {"success": True})["message_type"] == "trial_end_ack"
         reply = client.ask("infer", {"observation": seen(3, 0)}, step=0, repeat_index=7, action_case_id="case")
         assert (reply["repeat_index"], reply["action_case_id"], reply["step"]) == (7, "case", 0)
+        assert set(reply) == set(request("infer")), "no other fields"
         assert reply["payload"]["latency_ms"] > 0
         client.connection.send(encode(request("close")))
         with pytest.raises(ConnectionClosed):
@@ -522,16 +521,6 @@ def test_arrays_and_scalars_survive_the_way_and_nothing_else_is_an_array():
             codec.pack({"value": value})
 
 
-def test_an_envelope_has_its_fields_and_no_others():
-    frame = read_message(request("infer", {"observation": {}}, step=3, action_case_id="case", repeat_index=1))
-    assert (frame.message_type, frame.step, frame.session) == ("infer", 3, ("evaluation", "trial"))
-    assert frame.reply("infer_result", {"actions": []}).to_message() | {"sent_at": ""} == {
-        **request("infer_result", {"actions": []}, step=3, action_case_id="case", repeat_index=1),
-        "message_id": frame.message_id,
-        "sent_at": "",
-    }
-
-
 def test_a_checkpoint_is_found_by_xpolicylabs_name_of_a_run(reacher, tmp_path):
     run = {"bench_name": "RoboTwin", "ckpt_name": "first", "env_cfg_type": "arx_x5", "action_type": "joint", "seed": 0}
     with pytest.raises(CheckpointError, match="RoboTwin-first-arx_x5-joint-0"):
@@ -582,13 +571,3 @@ def test_the_environments_side_needs_nothing_of_ours(adapter, reacher):
     called = subprocess.run([sys.executable, "-c", program, root], capture_output=True, text=True, check=True)
     assert "ugr_lightning" not in called.stdout.replace("__editable__", "")
     assert "torch" not in called.stdout.split()
-
-
-def test_serving_in_a_thread_ends_with_its_block(reacher):
-    before = threading.active_count()
-    with serve(reacher) as server:
-        client = Client(server.url)
-    with pytest.raises(ConnectionClosed):
-        client.ask("heartbeat")
-    client.close()
-    assert threading.active_count() <= before + 1  # the client's own receiver may take a moment to end

@@ -1,5 +1,6 @@
 from pathlib import Path
 
+import deployed
 import numpy as np
 import pytest
 import torch
@@ -9,7 +10,6 @@ from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.folder import episode_path, write_seeds
 from ugr_lightning.data.formats.robotwin import write_episode
 from ugr_lightning.embodiment import CAMERAS
-from ugr_lightning.models.act import ACT
 from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.results.results import EpisodeResult, append_result
@@ -91,23 +91,8 @@ def tiny_act():
     """Builds an ACT of a few numbers that refines, with a branch and an uncertainty that do something."""
 
     def build(refine=Uncertainty, chunk_length=10):
-        torch.manual_seed(0)
-        policy = ACT(
-            refine() if refine else None,
-            chunk_length=chunk_length,
-            dim=16,
-            feedforward=32,
-            heads=2,
-            encoder_layers=1,
-            decoder_layers=1,
-            cvae_layers=1,
-            latent_dim=4,
-            dropout=0.1,
-            backbone_width=8,
-            backbone_stem="unshuffle",
-            backbone_norm="batch",
-            precision="fp32",
-        )
+        sizes = {"cvae_layers": 1, "dropout": 0.1, "backbone_stem": "unshuffle", "chunk_length": chunk_length}
+        policy = deployed.tiny_act(False, refine=refine() if refine else None, **sizes)
         if refine:
             for layer in (policy.branch.head, policy.uncertainty_head):
                 torch.nn.init.normal_(layer.weight)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from made_up import episode
 
 from ugr_lightning.bridges.graph import in_fp32, load_graph, load_onnx
 from ugr_lightning.cli.main import main
@@ -14,7 +15,7 @@ from ugr_lightning.models.checkpoint import load_policy, save_policy
 from ugr_lightning.models.diffusion import DiffusionPolicy
 from ugr_lightning.models.keyframes import KeyframeSettings
 from ugr_lightning.models.refine.uncertainty import Uncertainty
-from ugr_lightning.results.results import EpisodeResult, append_result
+from ugr_lightning.results.results import append_result
 
 needs_onnx = pytest.mark.skipif(
     any(importlib.util.find_spec(name) is None for name in ("onnx", "onnxscript", "onnxruntime")),
@@ -99,9 +100,8 @@ def test_a_policy_that_samples_and_looks_back_is_exported_too(tmp_path, monkeypa
 def test_the_card_says_what_it_is_and_how_well_it_does(refined):
     sha = load_policy("policy.ckpt")[1].sha256
     for seed in range(4):
-        result = EpisodeResult("click_alarmclock", "demo_clean", seed, "hash", "ACT", sha, "aggregate", seed > 0, 9)
-        append_result("evaluation.jsonl", result)
-    append_result("evaluation.jsonl", EpisodeResult("other", "demo_clean", 9, "hash", "ACT", "another", "1", True, 9))
+        append_result("evaluation.jsonl", episode(seed, seed > 0, checkpoint=sha))
+    append_result("evaluation.jsonl", episode(9, task="other", checkpoint="another"))
     assert main(["export", "policy.ckpt", "--to", "safetensors", "--out", "folder", "--licence", "mit"]) == 0
     card = Path("folder/README.md").read_text()
     for part in ("license: mit", "click_alarmclock", "train episodes: 2: 0, 2", "3/4 = 75.0%", "[30.1%", sha, "torch "):

@@ -1,7 +1,8 @@
 import pytest
+from made_up import episode
 
 from ugr_lightning.cli.main import main
-from ugr_lightning.results.results import EpisodeResult, append_result
+from ugr_lightning.results.results import append_result
 
 
 @pytest.fixture
@@ -9,10 +10,7 @@ def files(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     for policy, successes in (("base", 10), ("uncert", 18)):
         for seed in range(20):
-            result = EpisodeResult(
-                "click_alarmclock", "demo_clean", seed, "hash", "ACT", policy, "25", seed < successes, 9
-            )
-            append_result(f"{policy}.jsonl", result)
+            append_result(f"{policy}.jsonl", episode(seed, seed < successes, checkpoint=policy, execution="25"))
     return ["--runs", "base=base.jsonl", "uncert=uncert.jsonl"]
 
 

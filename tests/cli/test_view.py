@@ -2,10 +2,10 @@ import sys
 
 import numpy as np
 import pytest
+from made_up import episode
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.data.formats import detect
-from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.rollout.traces import write_trace
 from ugr_lightning.rollout.trajectory import EpisodeTrace
 from ugr_lightning.sim.frame import Frame
@@ -60,8 +60,7 @@ def test_a_rollout_is_shown_from_its_trace(tmp_path):
     frame = Frame(np.zeros((0, 4, 4, 3)), *np.zeros((2, 14), np.float32), np.zeros((2, 7)), np.zeros(2, bool), True)
     plan, doubt = np.ones((10, 14)), np.zeros(10)
     trace = EpisodeTrace([frame] * 3, [None] * 2, [plan, None], [doubt, None])
-    result = EpisodeResult("reach", "demo_clean", 5, "hash", "ACT", "sha", "aggregate", True, 2)
-    write_trace(tmp_path, result, trace)
+    write_trace(tmp_path, episode(5, task="reach", steps=2), trace)
     (path,) = tmp_path.glob("*.npz")
     assert main(["view", str(path), "--out", str(tmp_path / "view.rrd")]) == 0
     found = read_back(tmp_path / "view.rrd")

@@ -1,17 +1,15 @@
 import json
 
 import pytest
+from made_up import episodes
 
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.evaluations import RunInfo, read_benchmark, read_labelled
-from ugr_lightning.results.results import EpisodeResult, append_result
+from ugr_lightning.results.results import append_result
 
 
-def write(path, outcomes, *, checkpoint="abc", policy="ACT", execution="aggregate"):
-    for index, success in enumerate(outcomes):
-        result = EpisodeResult(
-            "click_alarmclock", "demo_clean", 100_000 + index, "hash", policy, checkpoint, execution, bool(success), 9
-        )
+def write(path, outcomes, **about):
+    for result in episodes(outcomes, **about):
         append_result(path, result)
 
 

@@ -4,11 +4,11 @@ from threading import Thread
 
 import numpy as np
 import pytest
+from made_up import episode as result
 from scipy.stats import binomtest
 
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.results import (
-    EpisodeResult,
     append_result,
     drop_cut_off_line,
     read_results,
@@ -16,11 +16,6 @@ from ugr_lightning.results.results import (
     summarize,
     wilson_interval,
 )
-
-
-def result(seed=0, success=True, **more):
-    fields = {"task": "t", "setting": "s", "seed": seed, "seeds_hash": "h", "policy": "p", "checkpoint": None}
-    return EpisodeResult(**(fields | {"execution": "aggregate", "success": success, "steps": 7} | more))
 
 
 def test_wilson_interval_equals_scipy():
@@ -70,16 +65,16 @@ def test_a_line_cut_off_by_a_crash_does_not_swallow_the_next_one(tmp_path):
 @pytest.mark.parametrize("change", [drop_cut_off_line, lambda path: append_result(path, result(1))])
 def test_two_that_write_one_file_take_turns(tmp_path, change):
     path = tmp_path / "r.jsonl"
-    append_result(path, result())
+    append_result(path, result(0))
     with path.open("ab") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
-        other.write(b'{"task": "t", ')
+        other.write(b'{"task": "click_alarmclock", ')
         other.flush()
         waiting = Thread(target=change, args=(path,))
         waiting.start()
         waiting.join(0.2)
         assert waiting.is_alive()
-        other.write(json.dumps(result(2).to_dict())[1:].replace('"task": "t", ', "").encode() + b"\n")
+        other.write(json.dumps(result(2).to_dict())[1:].replace('"task": "click_alarmclock", ', "").encode() + b"\n")
     waiting.join(10)
     assert {item.seed for item in read_results(path)} >= {0, 2}
 

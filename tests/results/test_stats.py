@@ -2,10 +2,10 @@ import itertools
 
 import numpy as np
 import pytest
+from made_up import episodes
 from scipy.stats import binom, binomtest
 
 from ugr_lightning.errors import DataError
-from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.results.stats import (
     PairedTable,
     compare,
@@ -13,15 +13,6 @@ from ugr_lightning.results.stats import (
     pair_by_seed,
     paired_difference_interval,
 )
-
-
-def episodes(outcomes, *, first_seed=100_000, task="click_alarmclock", crash=None):
-    return [
-        EpisodeResult(
-            task, "demo_clean", first_seed + i, "hash", "ACT", None, "aggregate", bool(success), 10, crash=crash
-        )
-        for i, success in enumerate(outcomes)
-    ]
 
 
 def test_mcnemar_is_the_sum_of_the_tails_of_the_binomial_distribution():

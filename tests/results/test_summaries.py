@@ -1,17 +1,17 @@
 import json
 from pathlib import Path
 
+import made_up
 import pytest
 
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.evaluations import Evaluation
-from ugr_lightning.results.results import EpisodeResult, summarize
+from ugr_lightning.results.results import summarize
 from ugr_lightning.results.summaries import read_evaluations, read_summary, write_summary
 
 
 def episode(seed, execution, success, crash=None, sha="abc"):
-    about = ("click_alarmclock", "demo_clean", seed, "hash", "ACT", sha)
-    return EpisodeResult(*about, execution, success, 9, crash=crash)
+    return made_up.episode(seed, success, execution=execution, crash=crash, checkpoint=sha)
 
 
 @pytest.fixture

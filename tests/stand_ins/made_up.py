@@ -1,4 +1,4 @@
-"""Made-up evaluations."""
+"""Made-up episodes and evaluations."""
 
 from pathlib import Path
 
@@ -8,16 +8,21 @@ from ugr_lightning.results.evaluations import Evaluation
 from ugr_lightning.results.results import EpisodeResult
 
 
-def evaluation(
-    policy, outcomes, *, training_seed=0, task="click_alarmclock", execution="aggregate", first_seed=100_000
-):
+def episode(seed=100_000, success=True, **more):
+    """One episode of a checkpoint."""
+    about = {"task": "click_alarmclock", "setting": "demo_clean", "seed": seed, "seeds_hash": "hash", "policy": "ACT"}
+    about |= {"checkpoint": "abc", "execution": "aggregate", "success": bool(success), "steps": 9}
+    return EpisodeResult(**about | more)
+
+
+def episodes(outcomes, *, first_seed=100_000, **more):
+    """Episodes of one checkpoint, with the outcome of each seed."""
+    return [episode(first_seed + i, success, **more) for i, success in enumerate(outcomes)]
+
+
+def evaluation(policy, outcomes, *, training_seed=0, task="click_alarmclock", execution="aggregate"):
     """One evaluation of a checkpoint, with the outcome of each seed."""
-    results = [
-        EpisodeResult(
-            task, "demo_clean", first_seed + i, "hash", "ACT", f"{policy}{training_seed}", execution, bool(o), 9
-        )
-        for i, o in enumerate(outcomes)
-    ]
+    results = episodes(outcomes, task=task, execution=execution, checkpoint=f"{policy}{training_seed}")
     return Evaluation(policy, training_seed, Path(f"{policy}-{task}-{training_seed}.jsonl"), results)
 
 

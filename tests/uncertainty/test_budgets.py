@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
+from deployed import tiny_act
 
-from ugr_lightning.contract import Observation, Statistics
-from ugr_lightning.models.act import ACT
+from ugr_lightning.contract import Observation
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
@@ -23,17 +23,10 @@ N, K = 12, 10
 
 
 def policy(branch):
-    torch.manual_seed(0)
-    sizes = {"dim": 16, "feedforward": 32, "heads": 2, "encoder_layers": 1, "decoder_layers": 1, "cvae_layers": 0}
-    built = ACT(
-        Uncertainty(), branch, chunk_length=K, dropout=0.0, backbone_width=8, backbone_norm="batch", precision="fp32",
-        **sizes,
-    )  # fmt: skip
-    zeros, ones = torch.zeros(14), torch.ones(14)
-    built.set_statistics(Statistics(zeros, ones, -ones, ones, zeros, ones, -ones, ones))
+    built = tiny_act(refine=Uncertainty(), refine_branch=branch)
     for layer in (built.branch.head, built.uncertainty_head):
         torch.nn.init.normal_(layer.weight)
-    return built.eval()
+    return built
 
 
 def predictions(act):
