@@ -15,11 +15,3 @@ def test_demo_trains_evaluates_and_ends_with_a_table(tiny_config, world, capsys)
     out = capsys.readouterr().out
     assert "tensorboard --logdir runs" in out
     assert "TinyPolicy" in out
-
-
-def test_demo_with_a_config_that_is_not_there_lists_the_names(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    assert main(["demo", "--config", "[nothing_like_it]"]) == 2
-    said = capsys.readouterr().err
-    assert "uncert" in said
-    assert "paper/uncert" in said

@@ -68,18 +68,6 @@ def test_a_checkpoint_is_loaded_once_for_all_executions(world, tiny_act, untrain
     assert len(loaded) == 2
 
 
-def test_a_policy_of_another_robot_is_refused_before_any_episode(world, tiny_act, untrained, tmp_path, capsys):
-    policy = tiny_act()
-    checkpoint = untrained(policy, tmp_path)
-    content = torch.load(checkpoint)
-    content["policy"]["data"]["task"] = "aloha_transfer_cube"  # whose camera is another one
-    torch.save(content, checkpoint)
-    assert main(["test", str(checkpoint), "--episodes", "2"]) == 2
-    said = " ".join(capsys.readouterr().err.split())
-    assert "expected one for the robot of aloha_transfer_cube (state 14, action 14, cameras among top)" in said
-    assert world == []
-
-
 def test_the_rate_of_the_data_is_in_the_checkpoint_and_compared_with_the_simulators(
     world, tiny_act, untrained, tmp_path, recwarn
 ):
@@ -144,11 +132,6 @@ def test_seed_lists_are_what_they_say():
     assert seed_list(7, "click_alarmclock", 2)[0] == [7, 8]
     with pytest.raises(ConfigError, match="at most the 100"):
         seed_list("evaluation", "click_alarmclock", 101)
-
-
-def test_a_typo_in_an_option_is_named(capsys):
-    assert main(["rollout", "--polic", "zero"]) == 2
-    assert "`policy`" in capsys.readouterr().err
 
 
 def test_a_test_that_goes_on_runs_only_the_missing_episodes(world, tiny_config, capsys):

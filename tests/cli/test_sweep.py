@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from deployed import looking_act, save
 from PIL import Image
 
 from ugr_lightning.cli.main import main
@@ -81,6 +82,12 @@ def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
     assert [call["execution"] for call in world] == ["aggregate", 10, "adaptive"]
     assert main([*command, "--ratios", "[]", "--executions", "[aggregate-variance]"]) == 2
     assert "log-variance" in capsys.readouterr().err
+
+
+def test_a_policy_with_keyframes_is_asked_with_a_calibration(world, tmp_path):
+    checkpoint = save(looking_act(), tmp_path / "a.ckpt")
+    assert main(["sweep", str(checkpoint), "--episodes", "2", "--ratios", "[]"]) == 0
+    assert [call["execution"] for call in world] == ["aggregate", 10, "adaptive"]
 
 
 @pytest.mark.parametrize(

@@ -11,10 +11,6 @@ COLOURS = {
     "position": "tab:blue",
     "oracle": "black",
     "constant": "tab:gray",
-    "random": "tab:gray",
-    "gain": "tab:green",
-    "tail": "tab:purple",
-    "head": "tab:pink",
 }
 NAMES = {"learned": "s_k", "prior": "position prior", "position": "position only", "oracle": "oracle (true error)"}
 
