@@ -389,28 +389,11 @@ def test_two_processes_see_every_sample_once_and_validate_the_same(tiny_config, 
     still = ["--model.learning_rate", "0", "--model.policy.init_args.still", "true", "--trainer.max_steps", "-1"]
     still += ["--trainer.max_epochs", "1", "--average.decay", "0"]
     fit(tiny_config, *still, "--run", "one")
-    here = Path(__file__).parent
-    environment = {
-        **os.environ,
-        "PYTHONPATH": os.pathsep.join([str(here.parent / "stand_ins"), os.environ.get("PYTHONPATH", "")]),
-        "TINY_LOG": str(tmp_path / "seen"),
-        "OMP_NUM_THREADS": "1",
-    }
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), "TINY_LOG": str(tmp_path / "seen")}
     program = "import sys; from ugr_lightning.cli.main import main; sys.exit(main(sys.argv[1:]))"
     (tmp_path / "go.py").write_text(program)  # Lightning starts the second process by the script's path
-    command = [
-        sys.executable,
-        "go.py",
-        "fit",
-        "--config",
-        tiny_config,
-        *still,
-        "--run",
-        "two",
-        "--data.batch_size",
-        "2",
-    ]
-    command += ["--trainer.strategy", "ddp", "--trainer.devices", "2"]
+    command = [sys.executable, "go.py", "fit", "--config", tiny_config, *still]
+    command += "--run two --data.batch_size 2 --trainer.strategy ddp --trainer.devices 2".split()
     subprocess.run(command, env=environment, check=True, timeout=300)
     seen = [(tmp_path / f"seen.{rank}").read_text().split("\n")[:-1] for rank in (0, 1)]
     assert len(seen[0]) == len(seen[1]) == 6

@@ -1,4 +1,4 @@
-"""`ugr report`: results to Markdown, CSV and one HTML page, and how many episodes a comparison needs."""
+"""`ugr report`: results to Markdown and CSV, and how many episodes a comparison needs."""
 
 from functools import partial
 from pathlib import Path
