@@ -111,7 +111,7 @@ def test_statistics_are_found_in_the_weights_of_older_versions(tmp_path, network
         feature, _, name = key.rpartition(".")
         group = "unnormalize_outputs" if feature == "action" else "normalize_inputs"
         old[f"{group}.buffer_{feature.replace('.', '_')}.{name}"] = value
-    old["normalize_targets.buffer_action.mean"] = statistics["action.mean"]
+    old["normalize_targets.buffer_action.mean"] = statistics["action.mean"].clone()
     old["normalize_targets.buffer_action.max"] = torch.tensor(torch.inf)  # never fitted, never read
     policy, *_ = imported(tmp_path, {**named(network), **old}, cameras=("cam_high", "cam_wrist"))
     assert policy.cameras == ("cam_high", "cam_wrist")

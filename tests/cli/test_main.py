@@ -50,14 +50,6 @@ def test_a_disk_that_is_full_or_cannot_be_written_is_a_sentence_whatever_was_bei
         main(["fit"])
 
 
-def test_an_interrupt_is_exit_code_130(monkeypatch):
-    def interrupt(command, arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(entry, "_run", interrupt)
-    assert main(["fit"]) == 130
-
-
 def test_training_works_where_no_simulator_is_installed():
     program = """
 import sys

@@ -64,12 +64,6 @@ def test_too_few_episodes_say_nothing_and_how_many_would():
     assert "shared seeds to be found with 80 % power" in fewer
 
 
-def test_ten_episodes_that_agree_do_not_show_that_policies_are_equal():
-    may, may_not = words(*(evaluation(p, [1] * 10, training_seed=t) for p in ("base", "uncert") for t in (0, 1)))
-    assert may == ""
-    assert "too few" in may_not
-
-
 @pytest.mark.parametrize("rate", [1.0, 0.0, 0.6])
 @pytest.mark.parametrize(("n", "bound"), [(30, None), (100, "4%"), (400, "1%")])
 def test_policies_that_agree_on_every_episode_are_not_called_closer_than_their_number_allows(rate, n, bound):
@@ -93,11 +87,6 @@ def test_a_single_differing_episode_does_not_make_the_bound_tighter_than_none_do
     report = build_report(runs)
     assert report.contests[0].high < 0.03  # of the bootstrap
     assert "differ by less than 4% in" in conclude(report).may[0]
-
-
-def test_a_bound_is_rounded_up():
-    may, _ = words(*(drawn(p, 0.97, n=4000, seed=1) for p in ("base", "uncert")))
-    assert "differ by less than 1%" in may
 
 
 def test_many_comparisons_that_show_nothing_share_a_sentence_and_one_that_shows_something_has_its_own():

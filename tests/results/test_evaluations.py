@@ -37,12 +37,6 @@ def test_evaluations_come_in_the_order_of_the_grid_and_those_that_do_not_say_it_
     assert [item.policy for item in read_benchmark(benchmark)] == ["zebra", "bee", "ant", "base", "uncert"]
 
 
-def test_run_info_survives_its_file(tmp_path):
-    info = RunInfo("base", "click_alarmclock", 0, "c0ffee", "runs/a", "runs/a/x.ckpt", "abc", {"fit": 2.0})
-    info.write(tmp_path)
-    assert RunInfo.read(tmp_path) == info
-
-
 def test_a_run_without_episodes_yet_is_there_and_empty(benchmark):
     (benchmark / "results" / "base" / "results.jsonl").unlink()
     assert read_benchmark(benchmark)[0].results == []

@@ -69,10 +69,6 @@ def test_the_overview_adds_up_tasks_only_where_all_have_as_many_episodes():
     assert missing[3][3:] == ["", ""]
 
 
-def test_equal_results_give_an_equal_page():
-    assert to_markdown(table2(), "t") == to_markdown(table2(), "t")
-
-
 def test_csv_files_hold_the_numbers_unrounded(tmp_path):
     report = table2()
     paths = write_report(report, tmp_path / "new", "t")

@@ -58,7 +58,7 @@ def import_lerobot(
     """Make a policy of ours from an ACT policy of lerobot's.
 
     Args:
-        folder: `pretrained_model`, with `config.json`, `model.safetensors` and, of newer versions, the processors' files.
+        folder: `pretrained_model`, with `config.json`, `model.safetensors` and newer versions' processors.
         cameras: new names for the cameras, in the order of `input_features`; None takes lerobot's.
         precision: arithmetic of the trunk; `fp32` is lerobot's.
 

@@ -174,7 +174,8 @@ class ReferenceACT(nn.Module):
         body = self.backbones[0].get_submodule("0.body")
         seen = [self.input_proj(body((images[:, camera] - mean) / std)) for camera in range(cameras)]
         features = torch.cat(seen, dim=3)  # (B, D, h, V w), cameras side by side
-        positions = sine_map(*seen[0].shape[2:], features.shape[1]).repeat(1, cameras, 1)  # (h, V w, D)
+        height, width = seen[0].shape[2:]
+        positions = sine_map(height, width, features.shape[1]).repeat(1, cameras, 1)  # (h, V w, D)
         latent = images.new_zeros(batch, self.latent_dim) if latent is None else latent
         front = torch.stack([self.latent_out_proj(latent), self.input_proj_robot_state(state)])  # (2, B, D)
         x = torch.cat([front, features.flatten(2).permute(2, 0, 1)])  # (N, B, D)
@@ -194,7 +195,8 @@ class ReferenceACT(nn.Module):
         """Mean and log-variance, (B, latent) each, of the posterior of a demonstrated chunk (B, K, A)."""
         cls = self.cls_embed.weight.expand(1, len(state), -1)  # (1, B, D)
         parts = [cls, self.encoder_joint_proj(state)[None], self.encoder_action_proj(actions).transpose(0, 1)]
-        x, padding = torch.cat(parts), torch.cat([valid.new_zeros(len(valid), 2), ~valid], 1)  # (2 + K, B, D), (B, 2 + K)
+        x = torch.cat(parts)  # (2 + K, B, D)
+        padding = torch.cat([valid.new_zeros(len(valid), 2), ~valid], dim=1)  # (B, 2 + K)
         for layer in self.encoder.layers:
             x = layer(x, self.pos_table.transpose(0, 1), padding=padding)
         mean, log_variance = self.latent_proj(x[0]).chunk(2, dim=-1)

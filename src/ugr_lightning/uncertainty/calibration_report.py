@@ -216,9 +216,7 @@ def around_events(validation: Predictions, episodes: list[Episode], resamples: i
 
 def table(rows: list[Row]) -> Cells:
     """The comparison as cells, heading first."""
-    cells: Cells = [
-        ("statistic", "better", "s_k", "position prior", "constant or chance", "s_k - prior")
-    ]
+    cells: Cells = [("statistic", "better", "s_k", "position prior", "constant or chance", "s_k - prior")]
     for row in rows:
         shown = [_cell(row.learned), _cell(row.prior), f"{row.constant:.3g}", _cell(row.difference)]
         cells.append((row.name, row.better, *shown))
@@ -227,9 +225,7 @@ def table(rows: list[Row]) -> Cells:
 
 def event_table(events: dict[str, dict[str, Any]]) -> Cells:
     """Error and predicted deviation near events over those elsewhere, as cells, heading first."""
-    cells: Cells = [
-        ("event", "count", f"error within {NEAR} steps / elsewhere", "predicted deviation, likewise")
-    ]
+    cells: Cells = [("event", "count", f"error within {NEAR} steps / elsewhere", "predicted deviation, likewise")]
     for kind, of in events.items():
         cells.append((kind, str(of["count"]), _cell(of["error_near"]), _cell(of["deviation_near"])))
     return cells

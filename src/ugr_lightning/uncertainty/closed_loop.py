@@ -43,9 +43,8 @@ def compare_uses(episodes: dict[str, Sequence[EpisodeResult]]) -> list[Use]:
     (_, first), *rest = episodes.items()
     found = [compare(results, first) for _, results in rest]
     corrected = holm([one.p_value for one in found])
-    compared: list[tuple[Comparison | None, float]] = [(None, 1.0), *zip(found, corrected, strict=True)]
-    totals = [(name, summarize(results), _queries(results)) for name, results in episodes.items()]
-    return [Use(*total, *comparison) for total, comparison in zip(totals, compared, strict=True)]
+    columns = zip(episodes.items(), [None, *found], [1.0, *corrected], strict=True)
+    return [Use(name, summarize(of), _queries(of), against, p) for (name, of), against, p in columns]
 
 
 def _queries(results: Sequence[EpisodeResult]) -> float:

@@ -58,7 +58,7 @@ def predict(
         Predictions in the order of episode and step.
     """
     std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
-    parts: list[dict[str, Any]] = []
+    parts: list[Predictions] = []
     for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
         with torch.no_grad():
             chunk = policy.predict(batch.observation)
@@ -68,18 +68,17 @@ def predict(
             return length.masked_fill(~batch.valid, torch.nan).double().numpy()
 
         parts.append(
-            {
-                "coarse": error(chunk.actions if chunk.coarse is None else chunk.coarse),
-                "executed": error(chunk.actions),
-                "log_variance": None if chunk.log_variance is None else chunk.log_variance.double().numpy(),
-                "refined": None if chunk.refined is None else chunk.refined.numpy(),
-                "episode": batch.episode.numpy(),
-                "step": batch.step.numpy(),
-            }
+            Predictions(
+                coarse=error(chunk.actions if chunk.coarse is None else chunk.coarse),
+                executed=error(chunk.actions),
+                log_variance=None if chunk.log_variance is None else chunk.log_variance.double().numpy(),
+                refined=None if chunk.refined is None else chunk.refined.numpy(),
+                episode=batch.episode.numpy(),
+                step=batch.step.numpy(),
+            )
         )
-    columns: dict[str, list[Any]] = {name: [part[name] for part in parts] for name in Predictions._fields}
-    whole: dict[str, Any] = {name: None if of[0] is None else np.concatenate(of) for name, of in columns.items()}
-    return Predictions(**whole)
+    whole: list[Any] = [None if of[0] is None else np.concatenate(of) for of in zip(*parts, strict=True)]
+    return Predictions(*whole)
 
 
 def batches(data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, batch_size: int = 16) -> Iterator[Batch]:

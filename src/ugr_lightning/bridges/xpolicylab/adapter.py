@@ -11,7 +11,6 @@ from ugr_lightning.bridges.adapter_files import write_adapter_folder
 from ugr_lightning.bridges.xpolicylab.model import XPolicyModel
 from ugr_lightning.errors import ConfigError
 
-
 write_adapter = partial(write_adapter_folder, "xpolicylab", XPolicyModel)
 
 

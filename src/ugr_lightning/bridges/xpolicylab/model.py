@@ -74,9 +74,7 @@ class XPolicyModel:
             raise ConfigError("action_type", "joint", model_cfg["action_type"], fix)
         self._count = count = int(number(model_cfg, "environments") or ENVIRONMENTS)
         checkpoint = find_checkpoint(model_cfg, folder or Path())
-        self.deployment = deployment_of(
-            model_cfg, checkpoint, cameras=CAMERAS, calibration=CALIBRATION, slots=count
-        )
+        self.deployment = deployment_of(model_cfg, checkpoint, cameras=CAMERAS, calibration=CALIBRATION, slots=count)
         self._free = list(reversed(range(count)))
         self._environments: dict[tuple[Hashable, int], Environment] = {}  # least recently used first
         self._latest: dict[tuple[Hashable, Hashable], list[int]] = {}  # by session and connection

@@ -129,7 +129,8 @@ class PolicyServer:
     def _answer_once(self, frame: Message, client: Hashable) -> bytes:
         """The reply to a request; the same again, without computing it again, where the request is."""
         if frame.message_type not in REPLIES:
-            return pack(_error(frame, "unknown_message_type", f"requests are {', '.join(REPLIES)} and {CLOSE}").to_message())
+            kinds = f"requests are {', '.join(REPLIES)} and {CLOSE}"
+            return pack(_error(frame, "unknown_message_type", kinds).to_message())
         envelope = replace(frame, payload={})
         if frame.message_id in self._answered:
             known, reply = self._answered[frame.message_id]
