@@ -131,7 +131,7 @@ class _Recording:
     """
 
     def __init__(self, name: str, cameras: tuple[str, ...]) -> None:
-        require_extra("ugr view", "view", "rerun.blueprint")
+        require_extra("ugr view", "view", "rerun", "rerun.blueprint")
         import rerun
         import rerun.blueprint as views
 

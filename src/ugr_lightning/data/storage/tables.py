@@ -25,7 +25,7 @@ def import_pyarrow() -> Any:
     Raises:
         ConfigError: it is not installed.
     """
-    require_extra("Parquet files", "lerobot", "pyarrow.parquet")
+    require_extra("Parquet files", "lerobot", "pyarrow", "pyarrow.parquet")
     import pyarrow
 
     return pyarrow
