@@ -33,8 +33,9 @@ def scores(folder):
     return [{key: value for key, value in row.items() if not key.startswith("speed/")} for row in rows]
 
 
-def test_fit_leaves_config_logs_and_checkpoints_and_a_second_one_disturbs_nothing(tiny_config):
+def test_fit_leaves_config_logs_and_checkpoints_and_a_second_one_disturbs_nothing(tiny_config, capsys):
     fit(tiny_config)
+    assert capsys.readouterr().out.endswith(f"trained to step 6: {RUN}\n")
     before = (RUN / "last.ckpt").read_bytes()
     fit(tiny_config, "--seed_everything", "1")
     assert (RUN / "last.ckpt").read_bytes() == before
@@ -273,11 +274,14 @@ def test_a_package_that_a_config_needs_is_named(tiny_config, capsys):
         (["--data.after_end", "holds"], "data.after_end"),
         (["--model.schedule", "cosines"], "model.schedule"),
         (["--average.decay", "0.9x"], "average.decay"),
+        (["--data.setting", "demo_foo"], "setting: expected demo_clean or demo_randomized"),
     ],
 )
 def test_a_word_that_is_none_of_the_right_ones_is_named(tiny_config, capsys, options, says):
     assert main(["fit", "--config", tiny_config, *options]) == 2
-    assert says in capsys.readouterr().err
+    said = capsys.readouterr()
+    assert says in said.err
+    assert "Recording" not in said.out
 
 
 @pytest.mark.parametrize("how", ["yaml", "apart", "joined"])

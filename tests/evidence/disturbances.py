@@ -1,6 +1,7 @@
 """What is done to a command that writes: it is killed, its disk is full or cannot be written, another does the same."""
 
 import functools
+import itertools
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -12,7 +13,7 @@ from trial import Command, Piece, assert_same, chance, content, size_of, small_d
 
 KILLED = {"training": TRAINED, "recording": RECORDED, "evaluation": EVALUATED, "conversion": converted("lerobot")}
 WRITING = [TRAINED, DECODED, RECORDED, EVALUATED, *map(converted, ("robotwin", "act", "original-act", "lerobot"))]
-MOMENTS = 5
+MOMENTS = 20
 PAGE = 4096
 
 
@@ -39,14 +40,18 @@ def undisturbed(job: Job, trial: Path) -> tuple[dict[str, Any], float, int]:
 
 
 def killed(job: Job, folder: Path, number: int) -> str:
-    """SIGKILL at a random moment of the work, then the command that goes on."""
+    """SIGKILL at a random moment of the work, then the command that goes on; earlier where the work had ended."""
     expected, seconds, _ = undisturbed(job, folder)
-    job.prepare(folder)
     moment = float(chance(job.name, number).uniform(0, seconds))
-    hit = Command(job.words(folder), folder).kill_after(lambda: job.begun(folder), moment)
-    ugr(job.again(folder), folder)
-    assert_same(expected, job.outcome(folder))
-    return f"{moment:.2f} of {seconds:.2f} s" if hit else f"{moment:.2f} s: it had ended"
+    for place in (folder / str(attempt) for attempt in itertools.count()):
+        place.mkdir()
+        job.prepare(place)
+        if Command(job.words(place), place).kill_after(functools.partial(job.begun, place), moment):
+            break
+        moment /= 2
+    ugr(job.again(place), place)
+    assert_same(expected, job.outcome(place))
+    return f"{moment:.2f} of {seconds:.2f} s"
 
 
 def full_disk(job: Job, folder: Path, number: int) -> str:

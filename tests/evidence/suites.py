@@ -37,6 +37,21 @@ SUITES = {
         "the same, bit for bit",
         ["tests/cli/test_fit.py", "tests/rollout/test_evaluate.py", "-k", "bit_for_bit or slots_or_history"],
     ),
+    "physics": (
+        "seeds again after other episodes, in another simulator and in another process",
+        "the same joints, bit for bit",
+        ["tests/sim/test_simulator.py", "tests/rollout/test_with_the_simulator.py", "-k", "same or repeat"],
+    ),
+    "round trips": (
+        "demonstrations converted to each format and back",
+        "the same states and actions; pictures within the codec's bound",
+        ["tests/data/test_conversion.py", "-k", "exact"],
+    ),
+    "parity": (
+        "our policy beside the original's arithmetic, aggregation beside the offline table, losses beside their sums",
+        "the same numbers",
+        ["tests/speed/test_reference_act.py", "tests/rollout/test_aggregation.py", "tests/models/test_losses.py"],
+    ),
     "checkpoints": (
         "code in a checkpoint; round trips through every exported format",
         "refused, never run; the same actions",
@@ -50,7 +65,7 @@ SUITES = {
     "statistics": (
         "intervals and tests beside those of SciPy and statsmodels",
         "the same",
-        ["tests/results/test_stats.py"],
+        ["tests/results"],
     ),
     "leaks": (
         "other validation episodes",

@@ -62,9 +62,14 @@ def record_demonstrations(data: "ChunkDataModule") -> None:
 
     Args:
         data: its `task`, `setting`, `episodes`, `folder` and `recording` say what is missing.
+
+    Raises:
+        ConfigError: no such setting.
     """
     from ugr_lightning.demos.collect import collect as record
+    from ugr_lightning.sim.settings import check_setting
 
+    check_setting(data.setting)
     recording = data.recording
     print(f"Recording demonstrations of {data.task} into {data.folder}", flush=True)
     record(

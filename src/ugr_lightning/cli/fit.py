@@ -235,6 +235,8 @@ class UGRCLI(LightningCLI):
     def fit(self, **given: Any) -> None:
         """Train; Lightning calls it in place of the trainer's."""
         self.trainer.fit(ckpt_path=self._get(self.config, "checkpoint"), **given)
+        if _is_first_process():
+            print(f"trained to step {self.trainer.global_step}: {self.trainer.log_dir}")
 
     def validate(self, **given: Any) -> None:
         """Validate; Lightning calls it in place of the trainer's."""
