@@ -10,6 +10,7 @@ from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.data.layout import Joint, Layout
+from ugr_lightning.data.split import Split
 from ugr_lightning.embodiment import CAMERAS
 from ugr_lightning.models.checkpoint import load_policy
 
@@ -111,3 +112,32 @@ def test_budgets_and_estimators_of_a_run_go_into_the_same_page(
         assert text in page
     assert "overlapping chunks" in said
     assert np.asarray(Image.open(folder / "budgets.png")).std() > 0
+
+
+def test_what_a_branch_could_correct_is_asked_on_episodes_that_nothing_was_trained_on(
+    ten_demonstrations, tmp_path, tiny_act, untrained, monkeypatch
+):
+    split = Split(train=(0, 1, 2, 3, 4, 9), validation=(5, 6, 7, 8))
+    monkeypatch.setattr("ugr_lightning.data.datamodule.split_episodes", lambda count, seed: split)
+    untrained(tiny_act(), tmp_path)
+    command = f"analyze {tmp_path}/policy_best.ckpt --data {ten_demonstrations} --resamples 20 --residuals"
+    assert main(command.split()) == 0
+    folder = tmp_path / "analysis-policy_best"
+    found = json.loads((folder / "analysis.json").read_text())["foretold"]
+    assert len(found) == 3
+    for r2 in found.values():
+        assert r2["low"] <= r2["value"] <= r2["high"] <= 1
+    assert "| other new episodes, linear |" in (folder / "analysis.md").read_text()
+
+
+def test_a_policy_without_an_uncertainty_is_asked_for_what_it_has(
+    ten_demonstrations, tmp_path, tiny_act, untrained, capsys
+):
+    untrained(tiny_act(refine=None), tmp_path)
+    command = ["analyze", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations), "--resamples", "5"]
+    assert main(command) == 0
+    assert "predicts no s_k" in capsys.readouterr().out
+    assert main([*command, "--residuals"]) == 2  # two episodes are too few to fit on the others
+    assert "at least 3 episodes, got 2" in capsys.readouterr().err
+    for option in ("--budgets", "--estimators"):
+        assert main([*command, option]) == 2

@@ -13,7 +13,7 @@ from trial import Command, Piece, assert_same, chance, content, size_of, small_d
 
 KILLED = {"training": TRAINED, "recording": RECORDED, "evaluation": EVALUATED, "conversion": converted("lerobot")}
 WRITING = [TRAINED, DECODED, RECORDED, EVALUATED, *map(converted, ("robotwin", "act", "original-act", "lerobot"))]
-MOMENTS = 20
+MOMENTS = 5
 PAGE = 4096
 
 

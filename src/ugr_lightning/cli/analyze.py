@@ -18,10 +18,13 @@ def _analyze(
     resamples: Count = 500,
     budgets: bool = False,
     estimators: bool = False,
+    residuals: bool = False,
     traces: str | None = None,
     out: str | None = None,
 ) -> int:
     """Say whether a policy's uncertainty knows the error, on the validation episodes of its own split.
+
+    Policies without a predicted uncertainty are asked for what they have: `residuals` and `traces`.
 
     Args:
         checkpoint: `best`, `best_loss`, `last`, or a checkpoint file.
@@ -33,6 +36,7 @@ def _analyze(
         resamples: draws of the bootstrap over episodes.
         budgets: also the error when from none to all of the steps are refined, chosen by s_k and by its rivals.
         estimators: also other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+        residuals: also how much of the error on new scenes can be foretold from what a refinement branch sees.
         traces: folder that `ugr rollout --traces` filled; says whether s_k, or chunks that disagree, warned
             before episodes failed.
         out: folder for tables, numbers and figures; null means `analysis-<checkpoint>` beside the checkpoint.
@@ -48,8 +52,9 @@ def _analyze(
     policy, info = load_policy(file)
     if budgets:
         with_refine_ratio(policy, 1.0)  # an error where the policy ranks no steps
-    if estimators and not isinstance(policy, ACT):
-        raise ConfigError("--estimators", "a policy of the class ACT", type(policy).__name__, "Leave it out.")
+    for option, chosen in (("--estimators", estimators), ("--residuals", residuals)):
+        if chosen and not isinstance(policy, ACT):
+            raise ConfigError(option, "a policy of the class ACT", type(policy).__name__, "Leave it out.")
     opened = open_data(policy, info.trained_on, data, after_end)
     described = {"file": str(file), "sha256": info.sha256, "task": opened.task}
     study = kit.begin_study(policy, opened, described, stride=stride, resamples=resamples)
@@ -57,6 +62,8 @@ def _analyze(
         kit.add_budgets(study)
     if estimators:
         kit.add_estimators(study)
+    if residuals:
+        kit.add_foretold(study)
     if traces is not None:
         kit.add_failures(study, Path(traces))
     print(f"checkpoint: {file}\n{study}")

@@ -8,9 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.errors import CheckpointError, DataError
+from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.results.tables import Cells, as_markdown, as_text
@@ -18,10 +20,12 @@ from ugr_lightning.rollout.traces import read_traces
 from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
 from ugr_lightning.uncertainty.budgets import sweep, sweep_figure, sweep_table
+from ugr_lightning.uncertainty.calibration import position_mean
 from ugr_lightning.uncertainty.calibration_figures import calibration_figure, event_figure
 from ugr_lightning.uncertainty.estimators import estimate, estimator_table
 from ugr_lightning.uncertainty.events import KINDS, find_events
 from ugr_lightning.uncertainty.failure import Score, detect_failures, overlap_score, uncertainty_score
+from ugr_lightning.uncertainty.foretold import foretold, foretold_table
 from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, predict
 
 
@@ -50,8 +54,8 @@ class Study:
     resamples: int
     budget: int
     content: dict[str, Any]
-    tables: list[Cells]
-    figures: dict[str, Any]
+    tables: list[Cells] = field(default_factory=list)
+    figures: dict[str, Any] = field(default_factory=dict)
     sentences: list[str] = field(default_factory=list)
 
     def __str__(self) -> str:
@@ -61,7 +65,7 @@ class Study:
         """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
         title = f"Uncertainty of {self.content['checkpoint']['file']}"
         write_page(folder, "analysis", title, self.sentences, self.tables, self.figures, self.content)
-        prior = json.dumps(plain_json(self.content["position"]["training_error"]))
+        prior = json.dumps(plain_json(position_mean(self.training.coarse)))
         publish_text(folder / "prior.json", prior + "\n")
 
 
@@ -97,50 +101,67 @@ def write_page(
 def begin_study(
     policy: ChunkPolicy, data: ChunkDataModule, checkpoint: dict[str, str], *, stride: int, resamples: int
 ) -> Study:
-    """Predict on both parts of the split, and compare s_k with the error and with the position prior.
+    """Predict on both parts of the split; where the policy has an s_k, compare it with the error and with the prior.
 
     Args:
-        policy: from the checkpoint, with a log-variance per step.
+        policy: from the checkpoint.
         data: its demonstrations, after `setup`.
         checkpoint: its `file`, `sha256` and `task`.
         stride: control steps between two queries.
         resamples: draws of the bootstrap over episodes.
-
-    Raises:
-        CheckpointError: the policy predicts no log-variance.
     """
     fast, split = policy.for_inference(), data.episode_split
-    validation = predict(fast, data, split.validation, stride=stride)
-    if validation.log_variance is None:
-        fix = "Train with `refine` Uncertainty, or with `uncertainty_head: true`."
-        raise CheckpointError(checkpoint["file"], "a policy with a log-variance per step", "one without", fix)
-    training = predict(fast, data, split.train, stride=stride)
+    validation, training = (predict(fast, data, part, stride=stride) for part in (split.validation, split.train))
     budget = getattr(policy, "budget", None) or int(0.3 * policy.chunk_length)
-    rows = report.compare_with_prior(validation, training, budget, resamples)
-    verdict = report.calibration_verdict(rows, len(split.validation), budget)
-    found, seen = report.curves(validation, training), report.generalisation(validation, training, budget)
-    events = report.around_events(validation, data.demonstrations, resamples)
-    tables = [report.table(rows), report.generalisation_table(seen)]
-    tables += [report.coverage_table(found), report.event_table(events)]
-    figures = {"calibration": calibration_figure(found), **({"events": event_figure(events)} if events else {})}
-    content = {
+    content: dict[str, Any] = {
         "checkpoint": checkpoint,
         "validation": {"episodes": len(split.validation), "chunks": len(validation.step)},
         "settings": {"stride": stride, "after_end": data.after_end, "resamples": resamples, "budget": budget},
-        "verdict": verdict,
-        "statistics": [row._asdict() for row in rows],
-        "generalisation": seen,
-        "events": events,
-        **found,
     }
-    sentences = [verdict]
-    if unknown := [kind for kind in KINDS if not any(kind in find_events(each) for each in data.demonstrations)]:
-        sentences.append(f"The demonstrations do not tell of these events: {', '.join(unknown)}.")
-    return Study(policy, data, validation, training, stride, resamples, budget, content, tables, figures, sentences)
+    study = Study(policy, data, validation, training, stride, resamples, budget, content)
+    if validation.log_variance is None:
+        errors = [float(np.nanmean(part.executed)) for part in (training, validation)]
+        study.content["mean error"] = dict(zip(("training", "validation"), errors, strict=True))
+        study.sentences.append(
+            f"The policy predicts no s_k (`uncertainty_head: true` trains one). Its mean error is {errors[0]:.3g} on "
+            f"training and {errors[1]:.3g} on validation episodes, in standard deviations of an action."
+        )
+    else:
+        _add_calibration(study)
+    return study
+
+
+def _add_calibration(study: Study) -> None:
+    """Add how well s_k ranks errors, covers them, and knows events."""
+    validation, training, budget = study.validation, study.training, study.budget
+    rows = report.compare_with_prior(validation, training, budget, study.resamples)
+    verdict = report.calibration_verdict(rows, len(study.data.episode_split.validation), budget)
+    found, seen = report.curves(validation, training), report.generalisation(validation, training, budget)
+    events = report.around_events(validation, study.data.demonstrations, study.resamples)
+    study.tables += [report.table(rows), report.generalisation_table(seen)]
+    study.tables += [report.coverage_table(found), report.event_table(events)]
+    study.figures |= {"calibration": calibration_figure(found), **({"events": event_figure(events)} if events else {})}
+    statistics = [row._asdict() for row in rows]
+    study.content |= {"verdict": verdict, "statistics": statistics, "generalisation": seen, "events": events, **found}
+    study.sentences.append(verdict)
+    demonstrations = study.data.demonstrations
+    if unknown := [kind for kind in KINDS if not any(kind in find_events(each) for each in demonstrations)]:
+        study.sentences.append(f"The demonstrations do not tell of these events: {', '.join(unknown)}.")
+
+
+def _require_uncertainty(study: Study, option: str) -> None:
+    if study.validation.log_variance is None:
+        fix = "Train with `refine` Uncertainty, or with `uncertainty_head: true`."
+        raise ConfigError(option, "a policy with a log-variance per step", "one without", fix)
 
 
 def add_budgets(study: Study) -> None:
-    """Add the error when from none to all of the steps are refined."""
+    """Add the error when from none to all of the steps are refined.
+
+    Raises:
+        ConfigError: the policy has no s_k to choose them by.
+    """
+    _require_uncertainty(study, "--budgets")
     whole = with_refine_ratio(study.policy, 1.0).for_inference()
     everything = predict(whole, study.data, study.data.episode_split.validation, stride=study.stride)
     found = sweep(everything, study.training.coarse, resamples=study.resamples)
@@ -150,12 +171,25 @@ def add_budgets(study: Study) -> None:
 
 
 def add_estimators(study: Study) -> None:
-    """Add other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks."""
+    """Add other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+
+    Raises:
+        ConfigError: the policy has no s_k to compare them with.
+    """
+    _require_uncertainty(study, "--estimators")
     assert isinstance(study.policy, ACT)
     estimates = estimate(study.policy, study.data, study.data.episode_split.validation, stride=study.stride)
     table = estimator_table(study.validation, estimates, study.budget)
     study.content["estimators"] = table
     study.tables.append(table)
+
+
+def add_foretold(study: Study) -> None:
+    """Add how much of the error on new scenes a branch could take away."""
+    assert isinstance(study.policy, ACT)
+    found = foretold(study.policy, study.data, stride=study.stride, resamples=study.resamples)
+    study.content["foretold"] = found
+    study.tables.append(foretold_table(found))
 
 
 def add_failures(study: Study, folder: Path) -> None:
@@ -176,6 +210,8 @@ def add_failures(study: Study, folder: Path) -> None:
         raise DataError(folder, "traces of this checkpoint", "none", fix)
     std = study.data.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
     scores: dict[str, Score] = {"s_k": uncertainty_score, "overlapping chunks": overlap_score(std)}
+    if study.validation.log_variance is None:
+        del scores["s_k"]
     traces = {name: read_traces(paths) for name, paths in groups.items()}
     found = {
         f"{name}, {by}": detect_failures(episodes, score)
