@@ -81,6 +81,16 @@ def test_failures_are_told_from_traces_of_this_checkpoint_alone(command, capsys,
     assert (by_uncertainty["auroc"]["value"], by_overlap["auroc"]["value"]) == (1, 0)  # here successes wander
 
 
+def test_too_few_traces_of_one_execution_cost_nothing_of_the_page(command, capsys, tmp_path):
+    sha = hashlib.sha256((tmp_path / "policy_best.ckpt").read_bytes()).hexdigest()[:8]
+    arrays = {"seed": 0, "success": True, "steps": 4, "query": np.arange(1), "contacts": np.zeros((5, 2), bool)}
+    arrays |= {"chunks": np.zeros((1, 5, 14)), "log_variance": np.zeros((1, 5))}
+    np.savez(tmp_path / f"click_alarmclock-{sha}-TinyPolicy-aggregate-0.npz", **arrays)
+    assert main([*command, "--traces", str(tmp_path)]) == 0
+    assert "at least 4 successful and 2 failed episodes, got 1 and 0" in capsys.readouterr().out
+    assert (tmp_path / "analysis-policy_best" / "analysis.json").is_file()
+
+
 @pytest.mark.parametrize(("option", "says"), [("--budgets", "ranks"), ("--estimators", "ACT")])
 def test_what_a_policy_cannot_do_is_said_before_anything_is_computed(command, option, says, capsys):
     assert main([*command, option]) == 2

@@ -84,3 +84,9 @@ for line in {lines!r}:
     too_much = {line: names - MAY_LOAD.get(line.split()[0], set()) for line, names in loaded.items()}
     assert {line: names for line, names in too_much.items() if names} == {}
     assert len(loaded) == len(LINES)
+
+
+def test_garbage_is_collected_again_once_a_command_is_imported():
+    program = "import gc; from ugr_lightning.cli.main import main; main(['tasks']); "
+    program += "assert gc.isenabled() and gc.get_freeze_count() > 10_000"
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=120, stdout=subprocess.DEVNULL)

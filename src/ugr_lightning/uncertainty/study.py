@@ -24,7 +24,7 @@ from ugr_lightning.uncertainty.calibration import position_mean
 from ugr_lightning.uncertainty.calibration_figures import calibration_figure, event_figure
 from ugr_lightning.uncertainty.estimators import estimate, estimator_table
 from ugr_lightning.uncertainty.events import KINDS, find_events
-from ugr_lightning.uncertainty.failure import Score, detect_failures, overlap_score, uncertainty_score
+from ugr_lightning.uncertainty.failure import Alarms, Score, detect_failures, overlap_score, uncertainty_score
 from ugr_lightning.uncertainty.foretold import foretold, foretold_table
 from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, predict
 
@@ -212,12 +212,13 @@ def add_failures(study: Study, folder: Path) -> None:
     scores: dict[str, Score] = {"s_k": uncertainty_score, "overlapping chunks": overlap_score(std)}
     if study.validation.log_variance is None:
         del scores["s_k"]
-    traces = {name: read_traces(paths) for name, paths in groups.items()}
-    found = {
-        f"{name}, {by}": detect_failures(episodes, score)
-        for name, episodes in traces.items()
-        for by, score in scores.items()
-    }
+    found: dict[str, Alarms] = {}
+    for name, paths in groups.items():
+        episodes = read_traces(paths)
+        try:
+            found |= {f"{name}, {by}": detect_failures(episodes, score) for by, score in scores.items()}
+        except DataError as error:  # of one execution: what is known of the others stays
+            study.sentences.append(f"{name}: {error}")
     study.content["failures"] = found
     study.sentences += [f"{name}: {alarms}" for name, alarms in found.items()]
 
