@@ -47,7 +47,7 @@ def run(piece: Piece, work: Path, notes: list[dict[str, Any]], file: Path) -> No
     for number in (number for number in range(piece.count) if number not in passed):
         folder = work / piece.name / str(number)
         shutil.rmtree(folder, ignore_errors=True)
-        folder.mkdir(parents=True)
+        folder.mkdir(parents=True, exist_ok=True)  # there if a trial that was killed has left a disk mounted on it
         start, held = time.monotonic(), True
         try:
             said = piece.trial(folder, number)

@@ -127,8 +127,9 @@ def ridge(episodes: Sequence[Moments]) -> np.ndarray:
 
 def _solved(episodes: Sequence[Moments], penalty: float) -> np.ndarray:
     """Weights (F, A); the constant, which is the first feature, is not penalised."""
-    features, cross, _, steps = (sum(column) for column in zip(*episodes, strict=True))
-    grown = penalty * steps * np.eye(len(features))
+    features = np.sum([one.features for one in episodes], axis=0)  # (F, F)
+    cross = np.sum([one.cross for one in episodes], axis=0)  # (F, A)
+    grown = penalty * sum(one.steps for one in episodes) * np.eye(len(features))
     grown[0, 0] = 0.0
     weights: np.ndarray = np.linalg.solve(features + grown, cross)
     return weights
