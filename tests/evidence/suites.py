@@ -81,7 +81,7 @@ def run_tests(arguments: list[str], folder: Path, number: int) -> str:
     Raises:
         AssertionError: one failed, or none was found.
     """
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--basetemp", str(folder / "t")]
+    command = [sys.executable, "-m", "pytest", "-p", "no:cacheprovider", "--basetemp", str(folder / "t")]
     done = subprocess.run([*command, *arguments], cwd=ROOT, capture_output=True, text=True, check=False)
     last = done.stdout.strip().splitlines()[-1] if done.stdout.strip() else done.stderr[-300:]
     assert done.returncode == 0, done.stdout[-1500:]

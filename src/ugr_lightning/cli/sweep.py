@@ -52,6 +52,7 @@ def _sweep(
         device: where the policy computes in closed loop: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
         out: folder for episodes, tables and figure; null means `sweep-<checkpoint>` beside the checkpoint.
     """
+    from ugr_lightning.system.files import remove_unfinished
     from ugr_lightning.system.lock import locked
 
     file = resolve_checkpoint(checkpoint, run, root)
@@ -60,6 +61,7 @@ def _sweep(
     errors = _offline(plan, data, stride) if plan.ratios and data is not None else None
     folder = Path(out) if out else file.with_name(f"sweep-{file.stem}")
     with locked(folder / "sweep.lock", str(folder)):
+        remove_unfinished(folder)
         budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers, device)
         _report(plan, budgets, modes, errors, folder)
     return 0

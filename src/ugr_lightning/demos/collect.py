@@ -27,7 +27,7 @@ from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.sim.registry import open_simulator
 from ugr_lightning.sim.settings import check_setting
 from ugr_lightning.sim.tasks import all_task_names, check_task, task_summaries, task_version
-from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.files import publish_text, remove_unfinished
 from ugr_lightning.system.lock import locked
 from ugr_lightning.system.progress import Progress
 from ugr_lightning.system.spread import spread
@@ -88,6 +88,8 @@ def collect(
     folder.mkdir(parents=True, exist_ok=True)
     settings = _settings(task, setting, image_size, noise, first_seed)
     with locked(folder / "recording.lock", f"Recording into {folder}", wait=True):
+        for place in (folder, folder / "instructions", folder / "video"):
+            remove_unfinished(place)
         if _is_complete(folder, episodes, settings):
             return
         open_task = partial(open_simulator, task, setting=setting, image_size=image_size)

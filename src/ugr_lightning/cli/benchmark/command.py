@@ -17,7 +17,7 @@ from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.errors import ConfigError, UGRError
 from ugr_lightning.results.evaluations import RESULTS_FILE, RUN_FILE, RunInfo
 from ugr_lightning.results.results import drop_cut_off_line, read_results
-from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.files import publish_text, remove_unfinished
 from ugr_lightning.system.lock import Lock, locked
 from ugr_lightning.system.progress import clock
 from ugr_lightning.training.runs import resolve_checkpoint, versions_of
@@ -151,6 +151,7 @@ class Benchmark:
             try:
                 with locked(results / "job.lock", job.name) as own:
                     drop_cut_off_line(results / RESULTS_FILE)
+                    remove_unfinished(results)
                     self._run(job, title, own)
             except (UGRError, Failure) as error:
                 failures[job.name] = str(error)

@@ -41,7 +41,7 @@ class PolicyCheckpoints(Checkpoint):
         folder = Path(trainer.log_dir or trainer.default_root_dir)
         self.best = {name: value for name, value in self.best.items() if (folder / name).is_file()}
         if trainer.is_global_zero:
-            for name in FILES.values():
+            for name in (*FILES.values(), "config.yaml", "metrics.csv"):
                 remove_unfinished(folder, name)
 
     def on_validation_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
