@@ -9,6 +9,7 @@ import json
 import os
 import shutil
 import sys
+import textwrap
 import time
 import warnings
 from pathlib import Path
@@ -34,7 +35,7 @@ HEADING = """# When things go wrong
 Made by `make evidence`, which goes on where it was stopped; `make evidence ARGS="--only 'killed/*'"` runs a part. Every
 trial has a number that seeds its choices, such as the moment of a kill; they are in `build/evidence/trials.jsonl`.
 Recordings and evaluations are those of a simulator without physics, trainings those of a policy of a few numbers: what
-is tried is what is written, and when. [Going on with a training](../resume.md) says what to expect.
+is tried is what is written, and when. [Going on with a training](../resume.md) says what to expect. {}.
 
 | what is done | what has to come out | it did | said | minutes |
 |---|---|---|---|---|
@@ -78,9 +79,10 @@ def page(notes: list[dict[str, Any]]) -> str:
         else:
             outcome, said = f"{held} of {len(last)}", str(last[min(last)]["said"])
         minutes = sum(note["seconds"] for note in last.values()) / 60
-        said = " ".join(said.replace("|", "/").split())[:120]
+        said = textwrap.shorten(said.replace("|", "/"), 120, placeholder=" ...")
         rows.append(f"| {piece.does} | {piece.holds} | {outcome} | {said} | {minutes:.1f} |")
-    return HEADING + "\n".join(rows) + "\n"
+    whole = {(note["piece"], note["trial"]): note["seconds"] for note in notes}
+    return HEADING.format(f"{len(whole)} trials in {sum(whole.values()) / 60:.0f} minutes") + "\n".join(rows) + "\n"
 
 
 def main() -> int:
