@@ -235,8 +235,9 @@ class UGRCLI(LightningCLI):
     def fit(self, **given: Any) -> None:
         """Train; Lightning calls it in place of the trainer's."""
         self.trainer.fit(ckpt_path=self._get(self.config, "checkpoint"), **given)
+        folder = self.trainer.log_dir  # asked in every process: the first one tells the others
         if _is_first_process():
-            print(f"trained to step {self.trainer.global_step}: {self.trainer.log_dir}")
+            print(f"trained to step {self.trainer.global_step}: {folder}")
 
     def validate(self, **given: Any) -> None:
         """Validate; Lightning calls it in place of the trainer's."""
