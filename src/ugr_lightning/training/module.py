@@ -178,7 +178,8 @@ class PolicyModule(LightningModule):
     def _not_finite(self, batch: Batch, terms: dict[str, Tensor]) -> NumericsError:
         """Write what is needed to replay the step, and name it."""
         step = self.trainer.global_step
-        dump = Path(self.trainer.log_dir or self.trainer.default_root_dir) / f"not_finite_step{step}.pt"
+        logs = (logger.log_dir for logger in self.trainer.loggers)  # the trainer's log_dir would wait for all processes
+        dump = Path(next(filter(None, logs), self.trainer.default_root_dir)) / f"not_finite_step{step}.pt"
         dump.parent.mkdir(parents=True, exist_ok=True)
         content = {"batch": batch._asdict(), "state_dict": self.state_dict(), "policy": self.policy.blueprint()}
         torch.save(content, dump)

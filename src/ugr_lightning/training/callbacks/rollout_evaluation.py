@@ -110,11 +110,11 @@ class RolloutEvaluation(Callback):
         if not self.every_n_steps or step % self.every_n_steps or step == self._last_step:
             return
         self._last_step = step
+        folder = Path(trainer.log_dir or trainer.default_root_dir)  # asked in every process: the first tells the others
         if trainer.is_global_zero:
-            self._evaluate(trainer, pl_module, step)
+            self._evaluate(trainer, pl_module, step, folder)
 
-    def _evaluate(self, trainer: Trainer, pl_module: LightningModule, step: int) -> None:
-        folder = Path(trainer.log_dir or trainer.default_root_dir)
+    def _evaluate(self, trainer: Trainer, pl_module: LightningModule, step: int, folder: Path) -> None:
         with averaged_weights(trainer, pl_module), tempfile.TemporaryDirectory() as scratch:
             results, uncertainty = self._run(trainer, pl_module, Path(scratch))
             video = _first_video(results)
