@@ -149,6 +149,7 @@ def test_a_kill_while_an_episode_is_filed_loses_nothing(reference, tmp_path, mon
         (tmp_path / name).touch()  # as SIGKILL leaves them
     record(tmp_path)
     assert content(tmp_path) == content(reference)
+    assert not list(tmp_path.rglob("*.partial"))
 
 
 def test_another_recording_in_the_folder_is_an_error_that_says_what_differs(reference):

@@ -125,3 +125,22 @@ def test_a_policy_of_another_robot_is_refused_before_the_first_step(what, tmp_pa
     with pytest.raises(ConfigError, match=r"robot of click_alarmclock.*rollout\.every_n_steps to 0"):
         train(tmp_path / "tiny" / "version_0", policy, [RolloutEvaluation(every_n_steps=1)], max_steps=5)
     assert world == []
+
+
+@pytest.mark.parametrize("first", [True, False])
+def test_every_process_asks_where_the_run_is_because_the_first_one_waits_for_them(tmp_path, monkeypatch, first):
+    asked, evaluated = [], []
+
+    class Process:
+        global_step, is_global_zero = 4, first
+
+        @property
+        def log_dir(self):
+            asked.append(True)
+            return str(tmp_path)
+
+    callback = RolloutEvaluation(every_n_steps=2)
+    monkeypatch.setattr(callback, "_evaluate", lambda *given: evaluated.append(given[-1]))
+    callback.on_train_batch_end(Process(), None)
+    assert asked == [True]
+    assert evaluated == [tmp_path] * first
