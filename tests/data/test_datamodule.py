@@ -6,7 +6,9 @@ import torch
 from jsonargparse import ArgumentParser
 from torch import nn
 
+from ugr_lightning.data import datamodule
 from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.data.formats.robotwin import RoboTwin
 from ugr_lightning.data.sampling import Sampling
 from ugr_lightning.embodiment import CAMERAS, STATE_DIM
 from ugr_lightning.errors import ConfigError, DataError
@@ -83,6 +85,25 @@ def test_after_setup_the_size_of_the_pictures_is_known_whether_it_was_given_or_n
     assert data.image_size == data.demonstrations[0].image_size
     assert data.train_dataloader().dataset[0].images.shape[-2:] == data.image_size
     assert _ready(recording_root, image_size=(8, 8)).image_size == (8, 8)
+
+
+def test_every_demonstration_is_read_once_however_often_data_are_prepared(recording_root, monkeypatch):
+    read, paths = RoboTwin.read, []
+    monkeypatch.setattr(
+        RoboTwin, "read", lambda form, place, *given: paths.append(place.path) or read(form, place, *given)
+    )
+    data = _ready(recording_root, cache="memmap")
+    data.prepare_data()  # as a second stage of a trainer does
+    data.setup("validate")
+    assert len(paths) == len(set(paths)) == 5
+
+
+def test_reading_many_demonstrations_says_how_far_it_is(recording_root, monkeypatch, capsys):
+    _ready(recording_root)
+    assert "reading" not in capsys.readouterr().err
+    monkeypatch.setattr(datamodule, "MANY", 5)
+    _ready(recording_root)
+    assert "click_alarmclock/demo_clean: 5/5" in capsys.readouterr().err
 
 
 def test_missing_episodes_are_recorded(tmp_path, record):

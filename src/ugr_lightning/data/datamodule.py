@@ -22,6 +22,10 @@ from ugr_lightning.data.split import Split, split_episodes
 from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.data.storage.cache import Cache, open_frames
 from ugr_lightning.errors import ConfigError, DataError
+from ugr_lightning.system.progress import Progress
+
+MANY = 200
+"""Demonstrations; reading and checking so many takes seconds, and how far it is gets shown."""
 
 
 @dataclass(frozen=True)
@@ -133,6 +137,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.layout, self.tasks = layout, (tasks,) if isinstance(tasks, str) else tuple(tasks)
         self.selection, self.normalise_over = Selection(self.tasks, episodes), normalise_over
         self.demonstrations: list[Episode] = []
+        self._checked: list[Episode] = []  # by `prepare_data`, so that `setup` need not read them again
 
     def prepare_data(self) -> None:
         """Record the demonstrations that are missing, and build a `memmap` cache, in one process per machine.
@@ -140,19 +145,22 @@ class ChunkDataModule(lightning.LightningDataModule):
         Raises:
             DataError: too few demonstrations, and nobody to record them.
         """
+        if self.demonstrations:
+            return
         if self.recorder is not None and not self.elsewhere:
             form, found = self._find()
             if len(found) < self.wanted and (form is None or form.name == RECORDED):
                 self.recorder(self)
         self._say_what_is_used()
         if self.cache == "memmap":
-            open_frames(self._read(), self.cache, self.image_size, self.folder)
+            self._checked = self._read()
+            open_frames(self._checked, self.cache, self.image_size, self.folder)
 
     def setup(self, stage: str | None = None) -> None:
         """Check the demonstrations, split them, compute statistics and decode; the second call does nothing."""
         if self.demonstrations:
             return
-        episodes = self._read()
+        episodes, self._checked = self._checked or self._read(), []
         self.episode_split: Split = split_episodes(len(episodes), self.split_seed)
         seen = self.episode_split.train if self.normalise_over == "train" else None
         self.statistics: Statistics = compute_statistics(episodes, seen, state=self.state)
@@ -216,7 +224,12 @@ class ChunkDataModule(lightning.LightningDataModule):
 
     def _read(self) -> list[Episode]:
         form, chosen, _ = self._chosen()
-        return [form.read(location, self.cameras, self.layout) for location in chosen.values()]
+        episodes = []
+        with Progress(f"reading {self.folder}", len(chosen), shown=len(chosen) >= MANY) as line:
+            for location in chosen.values():
+                episodes.append(form.read(location, self.cameras, self.layout))
+                line.advance()
+        return episodes
 
     @property
     def split(self) -> dict[str, Any]:

@@ -36,7 +36,8 @@ def numbered_files(folder: Path) -> dict[int, Path]:
     Raises:
         DataError: two files claim the same index.
     """
-    files = sorted(path for path in Path(folder).glob("*") if path.suffix in ENDINGS)
+    files = [path for path in Path(folder).glob("*") if path.suffix in ENDINGS]
+    files.sort(key=lambda path: path.name)
     numbers = {path: match for path in files if (match := NUMBERED.fullmatch(path.stem))}
     kinds = {match[1] for match in numbers.values()}
     if OURS in kinds:

@@ -362,3 +362,16 @@ def test_a_missing_file_says_so(tmp_path):
 def test_unknown_cameras_name_the_known_ones(cameras, episode_file):
     with pytest.raises(ConfigError, match="cam_high"):
         read_episode(episode_file, cameras)
+
+
+def test_pictures_are_checked_many_at_a_read_and_a_damaged_one_is_still_named(tmp_path, arrays, monkeypatch):
+    path, reads, read = episode_path(tmp_path, 0), [], h5py.Dataset.__getitem__
+    write_episode(path, **arrays(steps=150))
+    monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *given: reads.append(given[0].name) or read(*given))
+    read_episode(path)
+    assert 1 < reads.count(f"/{HEAD}") < 10
+    monkeypatch.undo()
+    with h5py.File(path, "r+") as file:
+        poke(HEAD, 149, b"GIF89a")(file)
+    with pytest.raises(DataError, match=HEAD + r"\[149\].*JPEG"):
+        read_episode(path)

@@ -1,7 +1,7 @@
 """Pictures in HDF5 files: plain numbers, or JPEGs in rows of bytes; checked once, then read a step at a time."""
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from ugr_lightning.data.storage.hdf5 import FIX, MAX_ROW_BYTES, find_dataset, ha
 from ugr_lightning.data.storage.jpeg import decode_jpeg, jpeg_size
 from ugr_lightning.errors import DataError
 
+MAX_ROWS = 64  # that are read at once
 CHOOSE = "Leave it out: choose cameras with colour pictures (`--cameras`, or the policy's `cameras`)."
 
 
@@ -182,9 +183,9 @@ def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
     if found.shape[0] != frames:
         raise DataError(where, f"{frames} pictures, one per row of joints", found.shape, FIX)
     sizes: list[tuple[int, int]] = []
-    for step in range(frames):  # one row at a time: what a file declares in total is never allocated
+    for step, row in enumerate(_rows_of(found)):
         try:
-            sizes.append(jpeg_size(_jpeg(found[step])))
+            sizes.append(jpeg_size(_jpeg(row)))
         except ValueError as error:
             raise DataError(f"{where}[{step}]", "a JPEG", str(error), FIX) from error
         if sizes[step] != sizes[0]:
@@ -192,6 +193,14 @@ def _check_jpegs(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
     if max(sizes[0]) > MAX_PIXELS:
         raise DataError(where, f"pictures of at most {MAX_PIXELS} pixels a side", sizes[0], FIX)
     return sizes[0]
+
+
+def _rows_of(found: h5py.Dataset) -> Iterator[Any]:
+    """The rows of a dataset, read some at a time: one by one is slow, and what a file declares is never allocated."""
+    size = int(np.prod(found.shape[1:], dtype=np.int64)) * found.dtype.itemsize
+    rows = min(MAX_ROWS, max(1, MAX_ROW_BYTES // max(size, 1)))
+    for first in range(0, len(found), rows):
+        yield from found[first : first + rows]
 
 
 def _check_raw(file: h5py.File, key: str, frames: int) -> tuple[int, int]:
