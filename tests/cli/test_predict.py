@@ -112,4 +112,4 @@ def test_what_older_checkpoints_do_not_say_of_their_data_is_as_it_was_then(comma
 
 def test_numbers_that_make_no_sense_are_refused(command, capsys):
     assert main([*command, "--episodes", "0"]) == 2
-    assert "episodes: expected a value that the key accepts" in " ".join(capsys.readouterr().err.split())
+    assert "episodes: expected a whole number above 0, got 0" in " ".join(capsys.readouterr().err.split())

@@ -1,6 +1,8 @@
+from typing import Literal
+
 import pytest
 
-from ugr_lightning.cli.parsing.call import call, call_one_of
+from ugr_lightning.cli.parsing.call import Count, CountOrZero, call, call_one_of
 from ugr_lightning.errors import ConfigError
 
 
@@ -88,3 +90,33 @@ def test_one_of_several_functions_is_called_by_name_and_its_first_arguments_by_p
         call_one_of(functions, "file", ["cpy"])
     with pytest.raises(ConfigError, match="one of copy, got nothing"):
         call_one_of(functions, "file", [])
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--seeds", "[0,1]"], "seeds: expected evaluation, selection or a whole number, got [0, 1]."),
+        (["--episodes", "0"], "episodes: expected a whole number above 0, got 0."),
+        (["--episodes", "many"], "episodes: expected a whole number above 0, got many."),
+        (["--pictures", "-1"], "pictures: expected a whole number, 0 or more, got -1."),
+        (["--ratios", "half"], "ratios: expected a number or null, got half."),
+        (["--size", "[1]"], "size: expected a tuple with 2 elements or null, got [1]."),
+        (["--quick", "perhaps"], "quick: expected true or false, got perhaps."),
+        (["--options", "3"], "options: expected a mapping, got 3."),
+    ],
+)
+def test_a_wrong_value_is_told_in_words_and_not_in_types(words, says):
+    def function(
+        seeds: Literal["evaluation", "selection"] | int = 0,
+        episodes: Count = 1,
+        pictures: CountOrZero = 0,
+        ratios: list[float] | None = None,
+        size: tuple[int, int] | None = None,
+        quick: bool = False,
+        options: dict[str, int] = {},  # noqa: B006 - jsonargparse copies it
+    ) -> int:
+        return 0
+
+    with pytest.raises(ConfigError) as error:
+        call(function, "try", words)
+    assert str(error.value) == f"{says} Correct the value."

@@ -132,7 +132,7 @@ def explain(error: Exception, parser: ArgumentParser | None) -> ConfigError:
         keys = re.findall(r"[Kk]ey \"([\w.\-]+)\": ", message)
         told = message.rpartition(f'"{keys[-1]}": ')[2] if keys else message
         where = ".".join(keys) or "configuration"
-        return ConfigError(where, "a value that the key accepts", told[:600].rstrip("."), "Correct the value.")
+        return ConfigError(where, *_wanted(told), "Correct the value.")
     key = unknown[-1]
     known = set(_known_keys(parser, message))
     near = difflib.get_close_matches(key, known, n=3) or difflib.get_close_matches(
@@ -140,6 +140,33 @@ def explain(error: Exception, parser: ArgumentParser | None) -> ConfigError:
     )
     fix = f"Did you mean {_either(near)}?" if near else "`--help` and `--print_config` list the keys."
     return ConfigError(key, "a known key", "an unknown one" + _context(message, key), fix)
+
+
+_IN_WORDS = {
+    "PositiveInt": "a whole number above 0",
+    "NonNegativeInt": "a whole number, 0 or more",
+    "int": "a whole number",
+    "float": "a number",
+    "bool": "true or false",
+    "str": "text",
+    "dict": "a mapping",
+    "list": "a list",
+    "NoneType": "null",
+}
+_KIND = r"(?:Expected an?|Not of type) (?:typing\.Literal\[(.*?)\]|<class '(\w+)'>|(\w+Int)\b|(tuple .*? elements))"
+_VALUE = r"(?:Got value|Given value|int\(\) with base 10|Int(?=: -?\d)): (.*?)(?=\.?$| - Expected| does not conform)"
+
+
+def _wanted(told: str) -> tuple[str, str]:
+    """What the types of a key accept, and the value that none of them does, in words where jsonargparse names both."""
+    choices: dict[str, None] = {}  # in order, each once
+    for words, kind, number, several in re.findall(_KIND, told):
+        choices |= dict.fromkeys(re.findall("'(.*?)'", words) or [_IN_WORDS.get(kind + number) or f"a {several}"])
+    values = re.findall(_VALUE, told)
+    if not choices or not values:
+        return "a value that the key accepts", told[:600].rstrip(".")
+    *others, last = choices
+    return f"{', '.join(others)} or {last}" if others else last, values[0].strip("'")
 
 
 def _context(message: str, key: str) -> str:
