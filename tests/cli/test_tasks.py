@@ -58,8 +58,8 @@ def test_verifying_prints_every_comparison_and_a_difference_is_exit_code_2(calls
 
 
 def test_evaluation_seeds_are_found_for_the_task_that_is_asked_for(calls, capsys):
-    assert main(["tasks", "seeds", "handover_block", "--workers", "1"]) == 0
-    assert calls == [("find", ("handover_block",), {"workers": 1})]
+    assert main(["tasks", "seeds", "handover_block", "--count", "20", "--workers", "1"]) == 0
+    assert calls == [("find", ("handover_block",), {"count": 20, "workers": 1})]
     assert capsys.readouterr().out == "list.json\n"
 
 

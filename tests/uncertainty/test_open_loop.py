@@ -35,7 +35,7 @@ def test_standing_still_is_left_out_where_states_are_no_commands():
     assert errors.still is None
     assert errors.overall()[2] is None
     table = error_table(errors)
-    assert table[0] == ("command", "training", "validation", "deviation")
+    assert table[0] == ("command, in its own unit", "training", "validation", "deviation")
     assert all(len(row) == 4 for row in table)
     assert "standing still" not in conclusion(errors, (3, 3))
 

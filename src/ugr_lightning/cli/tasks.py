@@ -93,19 +93,20 @@ def _verify(task: str = "all", setting: str = "all", episodes: Count = 50, worke
     return 2 if differing else 0
 
 
-def _seeds(task: str, workers: Count = 2) -> int:
-    """Write a task's list of evaluation seeds: the first 100 from 100000 upward that the expert solves.
+def _seeds(task: str, count: Count = 100, workers: Count = 2) -> int:
+    """Write a task's list of evaluation seeds: the first from 100000 upward that the expert solves.
 
     A new task, or a new version of one, needs it before policies can be tested on it.
 
     Args:
         task: a name, or `all`: all but outside ones.
+        count: how many seeds; fewer are a quick look at a new task, and wider intervals for good.
         workers: simulator processes.
     """
     from ugr_lightning.demos.verify import find_evaluation_seeds
 
     for name in named_tasks(task):
-        print(find_evaluation_seeds(name, workers=workers))
+        print(find_evaluation_seeds(name, count=count, workers=workers))
     return 0
 
 

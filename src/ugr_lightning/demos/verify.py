@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ugr_lightning.demos.survey import FIRST_SEED, Performance, perform
 from ugr_lightning.errors import SimulationError
-from ugr_lightning.sim.seeds import COUNT, EVALUATION_START, evaluation_seeds, seeds_hash
+from ugr_lightning.sim.seeds import EVALUATION_START, evaluation_seeds, seeds_hash
 from ugr_lightning.sim.tasks import seeds_file, task_version
 from ugr_lightning.system.files import publish_text
 
@@ -84,7 +84,7 @@ def verify_evaluation_seeds(
 def find_evaluation_seeds(
     task: str,
     *,
-    count: int = COUNT,
+    count: int,
     workers: int = 2,
     progress: bool = True,
 ) -> Path:

@@ -112,7 +112,8 @@ def command_names(dim: int) -> list[str]:
 
 def error_table(errors: Errors) -> Cells:
     """Errors by command, heading first, and their mean in standard deviations last."""
-    head = ("command", "training", "validation", *(() if errors.still is None else ("standing still",)), "deviation")
+    still = () if errors.still is None else ("standing still",)
+    head = ("command, in its own unit", "training", "validation", *still, "deviation")
     columns = [column for column in errors if column is not None]
     rows = zip(command_names(len(errors.std)), *columns, strict=True)
     total = [f"{value:.3f}" for value in errors.overall() if value is not None]

@@ -14,7 +14,6 @@ from ugr_lightning.sim.tasks import seeds_file, task_version
 DEMONSTRATION_START = 0
 EVALUATION_START = 100_000
 SELECTION_START = 200_000
-COUNT = 100
 
 SeedChoice = Literal["evaluation", "selection"] | int
 
