@@ -32,3 +32,16 @@ def test_collect_explains_a_wrong_task_and_a_wrong_setting_before_it_makes_a_fol
     assert main(["collect", "all", "--setting", "demo_random", "--root", str(tmp_path)]) == 2
     assert "Did you mean demo_randomized" in capsys.readouterr().err
     assert not list(tmp_path.iterdir())
+
+
+def test_collect_says_what_a_shard_leaves_to_be_done(monkeypatch, capsys):
+    parts = []
+    monkeypatch.setattr(
+        "ugr_lightning.demos.collect.collect", lambda task, folder, **options: parts.append(options["part"])
+    )
+    for more in (["--shard", "3/8"], ["--shard", "1/1"], []):
+        assert main(["collect", "hanging_mug", *more]) == 0
+    assert parts == [slice(2, None, 8), slice(0, None, 1), slice(0, None, 1)]
+    first, *others = capsys.readouterr().out.splitlines()
+    assert "--shard 1/1 completes" in first
+    assert others[0] == others[1]

@@ -162,3 +162,24 @@ def test_rollout_hands_the_setting_on_and_clean_is_the_default(world):
     assert main([*command, "--setting", "demo_randomized"]) == 0
     assert main(command) == 0
     assert [call["setting"] for call in world] == ["demo_randomized", "demo_clean"]
+
+
+@pytest.mark.parametrize("command", ["rollout --seeds evaluation", "test --executions [5]"])
+def test_shards_share_a_file_and_one_that_is_started_again_doubles_nothing(
+    world, tiny_act, untrained, tmp_path, capsys, command
+):
+    checkpoint, whole = untrained(tiny_act(), tmp_path), tmp_path / "whole.jsonl"
+    name, *options = command.split()
+    words = [name, str(checkpoint), *options, "--episodes", "7", "--out"]
+    assert main([*words, str(whole)]) == 0
+    world.clear()
+    for shard in ("2/3", "1/3", "2/3"):
+        assert main([*words, str(tmp_path / "parts.jsonl"), "--shard", shard]) == 0
+    seeds, _ = seed_list("evaluation", "click_alarmclock", 7)
+    assert [call["seeds"] for call in world] == [seeds[1::3], seeds[::3]]
+    capsys.readouterr()
+    assert main([*words, str(tmp_path / "parts.jsonl"), "--shard", "1/1"]) == 0
+    assert world[-1]["seeds"] == seeds[2::3], "a shard that never came"
+    assert "/7 = " in capsys.readouterr().out
+    found = sorted(read_results(tmp_path / "parts.jsonl"), key=lambda result: result.seed)
+    assert found == read_results(whole)

@@ -71,6 +71,21 @@ def test_a_sweep_that_was_stopped_runs_only_what_is_missing(command, world, tmp_
     assert "offline error" not in whole
 
 
+def test_shards_of_a_sweep_run_side_by_side_and_the_whole_writes_the_tables(command, world, tmp_path, capsys):
+    assert main([*command, "--out", str(tmp_path / "whole")]) == 0
+    folder = tmp_path / "parts"
+    with locked(folder / "sweep.lock", "another shard", shared=True):
+        for shard in ("2/2", "1/2"):
+            assert main([*command, "--out", str(folder), "--shard", shard]) == 0
+        assert main([*command, "--out", str(folder), "--shard", "1/1"]) == 2, "not while others run theirs"
+    assert not (folder / "sweep.md").exists()
+    world.clear()
+    assert main([*command, "--out", str(folder), "--shard", "1/1"]) == 0
+    assert world == []
+    for page in ("sweep.md", "sweep.json"):
+        assert (folder / page).read_text() == (tmp_path / "whole" / page).read_text()
+
+
 def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
     world, tiny_act, untrained, tmp_path, ten_demonstrations, capsys
 ):

@@ -17,12 +17,13 @@ from fake_simulator import MARKER, STEPS, FakeSimulator
 from ugr_lightning.data.folder import episode_path, find_episodes, read_scene_info, read_seeds
 from ugr_lightning.data.formats import find_format
 from ugr_lightning.data.formats.robotwin import read_episode
-from ugr_lightning.demos.collect import collect
+from ugr_lightning.demos.collect import EVERY, collect
 from ugr_lightning.demos.executed import read_executed
 from ugr_lightning.demos.noise import Noise
 from ugr_lightning.demos.recorder import Recorder, staged_episode
 from ugr_lightning.errors import ConfigError, DataError, SimulationError
 from ugr_lightning.sim.registry import open_simulator
+from ugr_lightning.system.lock import locked
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
 
@@ -95,13 +96,13 @@ def test_a_removed_episode_is_recorded_again_as_it_was(reference, tmp_path):
 SCRIPT = """
 import sys; sys.path[:0] = {folders!r}
 from test_collect import record
-record({folder!r}, workers=2)
+record({folder!r}, workers=2, part={part!r})
 """
 
 
-def start(folder):
+def start(folder, part=EVERY):
     here = Path(__file__).parent
-    code = SCRIPT.format(folders=[str(here), str(here.parent / "stand_ins")], folder=str(folder))
+    code = SCRIPT.format(folders=[str(here), str(here.parent / "stand_ins")], folder=str(folder), part=part)
     return subprocess.Popen([sys.executable, "-c", code], stderr=subprocess.PIPE)
 
 
@@ -127,6 +128,35 @@ def test_a_kill_at_any_moment_leaves_a_folder_that_can_be_completed(reference, t
     for worker in workers:
         assert select.select([worker], [], [], 30)[0], "a process was left behind"
         os.close(worker)
+    record(tmp_path)
+    assert content(tmp_path) == content(reference)
+
+
+def test_parts_recorded_side_by_side_make_the_data_set_of_one_recording(reference, tmp_path):
+    parts = [slice(first, None, 3) for first in range(3)]
+    with locked(tmp_path / "recording.lock", "another part", shared=True):
+        record(tmp_path, part=parts[0])
+        killed = start(tmp_path, parts[1])
+        wait_for_first_episode(tmp_path / "staging", killed)
+        killed.kill()
+        killed.communicate()
+        for part in parts[1:]:
+            record(tmp_path, part=part)
+    assert not find_episodes(tmp_path), "they wait for one that has the whole"
+    record(tmp_path)
+    record(tmp_path, part=parts[0])
+    assert content(tmp_path) == content(reference)
+    assert not (tmp_path / "staging").exists()
+
+
+def test_a_part_is_not_recorded_twice_and_what_is_missing_afterwards_is(reference, tmp_path):
+    record(tmp_path, episodes=2)
+    part = slice(1, None, 2)  # of the seeds 2, 3, 4, 5 ... every second: 3, which fails, and 5
+    record(tmp_path, part=part)
+    staged = {path.name: path.stat().st_mtime_ns for path in (tmp_path / "staging").glob("*.hdf5")}
+    assert list(staged) == ["seed5.hdf5"]
+    record(tmp_path, part=part)
+    assert staged == {path.name: path.stat().st_mtime_ns for path in (tmp_path / "staging").glob("*.hdf5")}
     record(tmp_path)
     assert content(tmp_path) == content(reference)
 

@@ -51,15 +51,22 @@ def test_files_from_before_there_were_budgets_are_still_read(tmp_path):
     assert [item.refine_ratio for item in read_results(path)] == [None, 0.5]
 
 
-def test_a_line_cut_off_by_a_crash_does_not_swallow_the_next_one(tmp_path):
+def test_a_line_cut_off_by_a_crash_goes_with_the_next_one_of_whoever_shares_the_file(tmp_path):
     path = tmp_path / "r.jsonl"
-    append_result(path, result())
+    append_result(path, result(0))
     path.write_bytes(path.read_bytes() + b'{"task": "t", "se')
     append_result(path, result(1))
-    lines = path.read_text().splitlines()
-    assert json.loads(lines[2])["seed"] == 1
-    with pytest.raises(DataError, match=r"r\.jsonl, line 2"):
-        read_results(path)
+    assert [item.seed for item in read_results(path)] == [0, 1]
+
+
+@pytest.mark.parametrize("change", [drop_cut_off_line, lambda path: append_result(path, result(2))])
+def test_a_whole_line_that_lacks_only_its_end_is_kept(tmp_path, change):
+    path = tmp_path / "r.jsonl"
+    append_result(path, result(0))
+    path.write_text(path.read_text() + json.dumps(result(1).to_dict()))
+    change(path)
+    assert [item.seed for item in read_results(path)][:2] == [0, 1]
+    assert path.read_text().endswith("\n")
 
 
 @pytest.mark.parametrize("change", [drop_cut_off_line, lambda path: append_result(path, result(1))])

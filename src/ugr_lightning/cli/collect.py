@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ugr_lightning.cli.parsing.call import call
+from ugr_lightning.cli.parsing.shard import every_nth
 from ugr_lightning.demos.noise import Noise
 
 if TYPE_CHECKING:
@@ -20,6 +21,7 @@ def _collect(
     noise: Noise = Noise(),  # noqa: B008 - frozen
     workers: int = 2,
     video: bool = False,
+    shard: str | None = None,
 ) -> int:
     """Record demonstrations of a task's scripted expert in RoboTwin 2.0's layout; goes on where it was stopped.
 
@@ -32,12 +34,15 @@ def _collect(
         noise: noise on the executed commands; the intended ones are the labels.
         workers: simulator processes.
         video: write a video of each episode as well.
+        shard: `3/8` is the third of eight processes that record into the folder at the same time; its episodes wait
+            there, until `1/1` or a training records what is missing and puts all in their order.
     """
     from ugr_lightning.demos.collect import collect as record
     from ugr_lightning.sim.settings import check_setting
     from ugr_lightning.sim.tasks import named_tasks
 
     check_setting(setting)
+    part = every_nth(shard)
     for name in named_tasks(task):
         folder = Path(root) / name / setting
         record(
@@ -49,8 +54,10 @@ def _collect(
             noise=noise,
             workers=workers,
             video=video,
+            part=part,
         )
-        print(f"{episodes} demonstrations in {folder}", flush=True)
+        whole = f"{episodes} demonstrations in {folder}"
+        print(whole if part.step == 1 else f"shard {shard} of {whole}; --shard 1/1 completes them", flush=True)
     return 0
 
 

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ugr_lightning.cli.parsing.call import call
+from ugr_lightning.cli.parsing.shard import every_nth
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.training.runs import resolve_checkpoint
 
@@ -35,6 +36,7 @@ def _rollout(
     traces: str | None = None,
     refine_ratio: float | None = None,
     device: str = "auto",
+    shard: str | None = None,
 ) -> int:
     """Let a policy act in a task and count its successes.
 
@@ -57,6 +59,8 @@ def _rollout(
         traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
         device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
+        shard: `3/8` is the third of eight processes that share the episodes and the results file; it runs what the file
+            lacks of its part. `1/1` runs what is missing afterwards, and sums up all.
     """
     from ugr_lightning.models.checkpoint import load_policy
     from ugr_lightning.rollout.actors import DUMMIES
@@ -70,6 +74,7 @@ def _rollout(
         raise ConfigError("--refine_ratio", "a checkpoint to refine less or more", "none", fix)
     if checkpoint is not None and policy is not None:
         raise ConfigError("--policy", "a checkpoint or one of these, not both", policy, "Leave one out.")
+    part = every_nth(shard)
     loaded = None if checkpoint is None else load_policy(resolve_checkpoint(checkpoint, run, root))
     spec = evaluation_spec(
         loaded[1].data if loaded else {},
@@ -82,7 +87,9 @@ def _rollout(
         workers=workers,
         out=Path(out) if out else None,
         traces=Path(traces) if traces else None,
+        resume=shard is not None,
     )
+    spec = replace(spec, seeds=spec.seeds[part])
     if video:
         spec = replace(spec, videos={spec.seeds[0]: Path(video)})
     actor = (
@@ -107,6 +114,7 @@ def _test(
     refine_ratio: float | None = None,
     device: str = "auto",
     resume: bool = False,
+    shard: str | None = None,
 ) -> int:
     """Success of a checkpoint on the task's evaluation seeds, with aggregated chunks and with executed ones.
 
@@ -124,11 +132,14 @@ def _test(
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
         device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
         resume: run only the episodes that the results file lacks.
+        shard: `3/8` is the third of eight processes that share the episodes and the results file; it runs what the file
+            lacks of its part. `1/1` runs what is missing afterwards, and sums up all.
     """
     from ugr_lightning.models.checkpoint import load_policy
     from ugr_lightning.rollout.evaluate import checkpoint_actor, evaluation_spec, run_episodes
     from ugr_lightning.rollout.simulators import Simulators
 
+    part = every_nth(shard)
     file = resolve_checkpoint(checkpoint, run, root)
     print(f"checkpoint: {file}")
     policy, info = load_policy(file)
@@ -141,8 +152,9 @@ def _test(
         workers=workers,
         out=Path(out) if out else beside / "evaluation.jsonl",
         traces=Path(traces) if traces else None,
-        resume=resume,
+        resume=resume or shard is not None,
     )
+    spec = replace(spec, seeds=spec.seeds[part])
     actor = checkpoint_actor(policy, info, spec.task, refine_ratio=refine_ratio, device=device)
     results = []
     with Simulators() as simulators:

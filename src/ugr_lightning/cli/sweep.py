@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ugr_lightning.cli.parsing.call import Count, call
+from ugr_lightning.cli.parsing.shard import every_nth
 from ugr_lightning.cli.rollout import ExecutionName, both_executions
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.results.results import EpisodeResult
@@ -32,6 +33,7 @@ def _sweep(
     workers: int = 2,
     device: str = "auto",
     out: str | None = None,
+    shard: str | None = None,
 ) -> int:
     """Success of one checkpoint by refinement budget and by execution, on the same seeds; goes on where it was stopped.
 
@@ -51,19 +53,24 @@ def _sweep(
         workers: simulator processes.
         device: where the policy computes in closed loop: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
         out: folder for episodes, tables and figure; null means `sweep-<checkpoint>` beside the checkpoint.
+        shard: `3/8` is the third of eight processes that share the episodes and the folder; it only runs those of its
+            part. `1/1` runs what is missing afterwards, and writes the tables.
     """
     from ugr_lightning.system.files import remove_unfinished
     from ugr_lightning.system.lock import locked
 
+    part = every_nth(shard)
+    alone = part.step == 1
     file = resolve_checkpoint(checkpoint, run, root)
     plan = _plan(file, ratios, executions)
     print(f"checkpoint: {file}")
-    errors = _offline(plan, data, stride) if plan.ratios and data is not None else None
+    errors = _offline(plan, data, stride) if alone and plan.ratios and data is not None else None
     folder = Path(out) if out else file.with_name(f"sweep-{file.stem}")
-    with locked(folder / "sweep.lock", str(folder)):
-        remove_unfinished(folder)
-        budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, workers, device)
-        _report(plan, budgets, modes, errors, folder)
+    with locked(folder / "sweep.lock", str(folder), shared=not alone):
+        budgets, modes = _closed_loop(plan, folder / "episodes.jsonl", seeds, episodes, part, workers, device)
+        if alone:
+            remove_unfinished(folder)
+            _report(plan, budgets, modes, errors, folder)
     return 0
 
 
@@ -137,6 +144,7 @@ def _closed_loop(
     file: Path,
     seeds: Literal["evaluation", "selection"] | int,
     episodes: int,
+    part: slice,
     workers: int,
     device: str,
 ) -> tuple[Episodes, Episodes]:
@@ -146,6 +154,7 @@ def _closed_loop(
     from ugr_lightning.uncertainty.closed_loop import budget_name, execution_name
 
     spec = evaluation_spec(plan.info.data, None, seeds, episodes, workers=workers, out=file, resume=True)
+    spec = replace(spec, seeds=spec.seeds[part])
     with Simulators() as simulators:
 
         def act(ratio: float | None, execution: ExecutionName) -> list[EpisodeResult]:

@@ -8,6 +8,7 @@ from contextlib import closing
 from dataclasses import asdict
 from functools import partial
 from importlib.metadata import version
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from ugr_lightning.system.lock import locked
 from ugr_lightning.system.progress import Progress
 from ugr_lightning.system.spread import spread
 
+EVERY = slice(0, None, 1)
 HOPELESS = 50
 """So many seeds without a success mean that the expert cannot do the task in this setting."""
 
@@ -48,12 +50,14 @@ def collect(
     first_seed: int = 0,
     progress: bool = True,
     video: bool = False,
+    part: slice = EVERY,
 ) -> None:
     """Fill a folder with successful demonstrations in RoboTwin 2.0's raw layout.
 
     Episode i is the i-th seed from `first_seed` upward that the expert solves: the content depends neither on the
     number of workers nor on interruptions. A call that finds enough episodes does nothing; one that finds fewer
-    records the rest. Two calls for one folder at the same time wait for each other.
+    records the rest. Two calls for one folder at the same time wait for each other, unless each has a part of its own:
+    these record side by side and leave their episodes staged, for the next call that has the whole to file.
 
     Args:
         task: a name from `ugr tasks`.
@@ -66,6 +70,7 @@ def collect(
         first_seed: where the search for seeds starts.
         progress: whether to show a progress line.
         video: whether to write `video/episode{i}.mp4` of the head camera as well.
+        part: which of the seeds, as places in their order: of `slice(2, None, 8)` the third, the eleventh and so on.
 
     Raises:
         ConfigError: no such task or setting.
@@ -87,17 +92,22 @@ def collect(
         raise DataError(folder, "a folder to record into", got, "Record into another folder.")
     folder.mkdir(parents=True, exist_ok=True)
     settings = _settings(task, setting, image_size, noise, first_seed)
-    with locked(folder / "recording.lock", f"Recording into {folder}", wait=True):
-        for place in (folder, folder / "instructions", folder / "video"):
+    alone = part.step == 1
+    with locked(folder / "recording.lock", f"Recording into {folder}", shared=not alone, wait=True):
+        for place in (folder, folder / "instructions", folder / "video") if alone else ():
             remove_unfinished(place)
         if _is_complete(folder, episodes, settings):
             return
         open_task = partial(open_simulator, task, setting=setting, image_size=image_size)
         build = partial(Recorder, open_task, noise, folder / "staging", video)
         ledger = _Ledger(folder, task, first_seed)
+        if not alone:
+            ledger = _Part(folder, task, first_seed, episodes, part)
+            episodes = ledger.wanted
         with Progress(f"{task}: demonstrations", episodes, done=ledger.count(episodes), shown=progress) as line:
             _record(ledger, episodes, build, workers, line)
-        shutil.rmtree(folder / "staging", ignore_errors=True)
+        if alone:
+            shutil.rmtree(folder / "staging", ignore_errors=True)
 
 
 def _record(ledger: "_Ledger", episodes: int, build: Callable[[], Recorder], workers: int, line: Progress) -> None:
@@ -106,6 +116,7 @@ def _record(ledger: "_Ledger", episodes: int, build: Callable[[], Recorder], wor
     given: list[int] = []
     again: list[int] = []  # seeds that have killed a process once
     outcomes: dict[int, Outcome] = {}
+    useless = 0
 
     def seeds() -> Iterator[int]:
         while True:
@@ -124,6 +135,11 @@ def _record(ledger: "_Ledger", episodes: int, build: Callable[[], Recorder], wor
                 line.message(f"Seed {seed}: {done.fault}; trying it once more.")
                 again.append(seed)
             for outcome in ledger.file(outcomes, episodes):
+                useless = 0 if outcome.failure is None else useless + 1
+                if useless >= HOPELESS:
+                    got = f"{useless} seeds in a row without success, the last because: {outcome.failure}"
+                    fix = "Check the task with `ugr rollout --policy expert`, or record with less noise."
+                    raise SimulationError("expert", "a task that it solves", got, fix)
                 if outcome.failure is None:
                     line.advance(f"seed {outcome.seed}, {outcome.steps} steps")
             if ledger.count(episodes) >= episodes:
@@ -146,7 +162,6 @@ class _Ledger:
         self._next_seed = self._seeds[-1] + 1 if self._seeds else first_seed
         self._gaps = [index for index in range(len(self._seeds)) if index not in self._present]
         self._order: list[int] = []
-        self._useless = 0
         if self._present and max(self._present) >= len(self._seeds):
             got = f"{len(self._seeds)} seeds and episode {max(self._present)}"
             fix = "Restore seed.txt, or record into another folder."
@@ -176,11 +191,6 @@ class _Ledger:
             elif outcome.failure is None:
                 self._seeds.append(outcome.seed)
                 self._place(len(self._seeds) - 1, outcome.seed)
-            self._useless = 0 if outcome.failure is None else self._useless + 1
-            if self._useless >= HOPELESS:
-                got = f"{self._useless} seeds in a row without success, the last because: {outcome.failure}"
-                fix = "Check the task with `ugr rollout --policy expert`, or record with less noise."
-                raise SimulationError("expert", "a task that it solves", got, fix)
             yield outcome
 
     def _refile(self, outcome: Outcome) -> None:
@@ -206,6 +216,34 @@ class _Ledger:
         target.parent.mkdir(exist_ok=True)
         os.replace(staged_episode(staging, seed), target)
         self._present.add(index)
+
+
+class _Part(_Ledger):
+    """One part of the seeds, while other processes record the others: what succeeds stays staged.
+
+    Attributes:
+        wanted: how many episodes are its share of those that are missing.
+    """
+
+    def __init__(self, folder: Path, task: str, first_seed: int, episodes: int, part: slice) -> None:
+        super().__init__(folder, task, first_seed)
+        self._episodes, self._part, self._staged = episodes, part, 0
+        self.wanted = len(range(episodes - super().count(episodes))[part])
+
+    def count(self, episodes: int) -> int:
+        """How many of its episodes are staged."""
+        return self._staged
+
+    def seeds(self, episodes: int) -> Iterator[int]:
+        """The seeds of the part, without end."""
+        return islice(super().seeds(self._episodes), self._part.start, None, self._part.step)
+
+    def file(self, outcomes: dict[int, Outcome], episodes: int) -> Iterator[Outcome]:
+        """Count what has been staged, in any order."""
+        while outcomes:
+            _, outcome = outcomes.popitem()
+            self._staged += outcome.failure is None
+            yield outcome
 
 
 def _settings(task: str, setting: str, image_size: tuple[int, int], noise: Noise, first_seed: int) -> dict[str, Any]:

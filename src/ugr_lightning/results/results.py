@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, BinaryIO, NamedTuple, get_args, get_origin, get_type_hints
 
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.tables import as_text
@@ -143,9 +143,7 @@ def append_result(path: str | Path, result: EpisodeResult) -> None:
     line = json.dumps(result.to_dict(), allow_nan=False) + "\n"
     with path.open("ab+") as file:
         flock(file.fileno(), fcntl.LOCK_EX)  # the end of the file is looked at, by `drop_cut_off_line` as well
-        if file.tell() > 0:  # a line that was cut off by a crash must not swallow this one
-            file.seek(-1, os.SEEK_END)
-            line = line if file.read(1) == b"\n" else "\n" + line
+        _end_last_line(file)
         file.write(line.encode())
         file.flush()
         os.fsync(file.fileno())
@@ -157,8 +155,20 @@ def drop_cut_off_line(path: Path) -> None:
         return
     with path.open("rb+") as file:
         flock(file.fileno(), fcntl.LOCK_EX)
-        content = file.read()
-        file.truncate(content.rfind(b"\n") + 1)
+        _end_last_line(file)
+
+
+def _end_last_line(file: BinaryIO) -> None:
+    """Leave a locked file with whole lines only: one that is no JSON was cut off."""
+    file.seek(0)
+    content = file.read()
+    last = content[content.rfind(b"\n") + 1 :]
+    try:
+        if last:
+            json.loads(last)
+            file.write(b"\n")
+    except ValueError:
+        file.truncate(len(content) - len(last))
 
 
 def read_results(path: str | Path) -> list[EpisodeResult]:

@@ -2,6 +2,7 @@
 
 import errno
 import os
+import platform
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -18,14 +19,14 @@ def publish(path: Path, write: Callable[[Path], object], *, keep_ending: bool = 
 
     Args:
         path: final file; its folder is made.
-        write: writes the whole content to the path it is given, `<path>.<process>.partial`.
-        keep_ending: give it `<stem>.<process>.partial<suffix>` instead, for writers that look at the ending.
+        write: writes the whole content to the path it is given, `<path>.<machine>-<process>.partial`.
+        keep_ending: give it `<stem>.<machine>-<process>.partial<suffix>` instead, for writers that look at the ending.
 
     Raises:
         OSError: the disk is full or the folder cannot be written to, whatever `write` itself raises then.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    aside = f"{os.getpid()}.partial"
+    aside = f"{platform.node()}-{os.getpid()}.partial"
     partial = path.with_name(f"{path.stem}.{aside}{path.suffix}" if keep_ending else f"{path.name}.{aside}")
     try:
         write(partial)
