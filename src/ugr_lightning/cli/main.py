@@ -24,6 +24,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "analyze": ("analyze", "whether a checkpoint's uncertainty knows the error"),
     "sweep": ("sweep", "one checkpoint with many budgets and executions, in closed loop"),
     "benchmark": ("benchmark.command", "policies, tasks and training seeds of one yaml: record, train, evaluate"),
+    "shards": ("shards", "collect, rollout, test or sweep in parts on a cluster, put together here"),
     "report": ("report", "compare policies: intervals, paired tests, what may be concluded"),
     "replay": ("replay", "execute recorded commands again and confirm the outcome"),
     "inspect": ("inspect", "say what a checkpoint, an episode or a folder is"),

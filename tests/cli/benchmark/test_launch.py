@@ -3,7 +3,7 @@ import sys
 
 import pytest
 
-from ugr_lightning.cli.benchmark.launch import launch
+from ugr_lightning.cli.benchmark.launch import _Command, launch
 from ugr_lightning.errors import ConfigError
 
 # Not within a test: on its import it closes all log handlers, and absl's then closes what pytest captures.
@@ -47,3 +47,9 @@ def test_an_option_that_submitit_does_not_know_is_explained(tmp_path, options):
     pytest.importorskip("submitit")
     with pytest.raises(ConfigError, match="slurm_partition: gpu"):
         launch([["true"]], tmp_path / "logs", options)
+
+
+def test_a_job_that_meets_its_time_limit_is_the_same_command_again(tmp_path):
+    pytest.importorskip("submitit")
+    assert _Command().checkpoint(writing(tmp_path / "a", code=3)).result() == 3
+    assert (tmp_path / "a").exists()

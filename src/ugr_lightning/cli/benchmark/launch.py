@@ -1,4 +1,4 @@
-"""Jobs of a benchmark handed to a cluster, or to several GPUs of one machine, through submitit."""
+"""Commands handed to a cluster, or to several GPUs of one machine, through submitit: a benchmark's jobs, or shards."""
 
 import subprocess
 from collections.abc import Mapping, Sequence
@@ -8,10 +8,24 @@ from typing import Any
 from ugr_lightning.errors import ConfigError, require_extra
 
 
+class _Command:
+    """Runs a command in a job, and again in the next one where a time limit has ended it."""
+
+    def __call__(self, command: list[str]) -> int:
+        return subprocess.call(command)
+
+    def checkpoint(self, command: list[str]) -> Any:
+        """What submitit is to submit in place of a job that has come to its time limit."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self, command)
+
+
 def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str, Any]) -> int:
     """Submit one job per command, as an array where the cluster has them, and wait for all.
 
-    On a cluster the jobs outlive this process: interrupting it only stops the waiting.
+    On a cluster the jobs outlive this process: interrupting it only stops the waiting. One that meets its time limit is
+    queued again by submitit, and its command goes on where it was.
 
     Args:
         commands: program and arguments of each job.
@@ -37,7 +51,7 @@ def launch(commands: Sequence[Sequence[str]], folder: Path, options: Mapping[str
     except (NameError, ValueError, RuntimeError, TypeError) as error:
         fix = "The options are those of submitit's AutoExecutor, such as {cluster: slurm, slurm_partition: gpu}."
         raise ConfigError("--launcher_options", "options of submitit", " ".join(str(error).split()), fix) from error
-    jobs = executor.map_array(subprocess.call, [list(command) for command in commands])
+    jobs = executor.map_array(_Command(), [list(command) for command in commands])
     print(f"submitted {len(jobs)} jobs: {', '.join(job.job_id for job in jobs)}; logs in {folder}", flush=True)
     failed = []
     for job in jobs:
