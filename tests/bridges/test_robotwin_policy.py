@@ -18,6 +18,8 @@ from ugr_lightning.bridges import robotwin_policy as robotwin
 from ugr_lightning.bridges.deployment import scaled
 from ugr_lightning.bridges.export import export_policy
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
+from ugr_lightning.models.checkpoint import sha256
+from ugr_lightning.rollout.alarm import Alarm, write_alarms
 from ugr_lightning.rollout.evaluate import run_episodes
 from ugr_lightning.rollout.spec import RolloutSpec
 
@@ -188,6 +190,30 @@ def test_the_folder_is_imported_by_its_name_and_acts_like_the_package(
     assert evaluate(package, model, fake_environment(), [0, 5]) == rolled_out(Reacher(), [0, 5], 3)
     model = package.get_model(read_settings(folder, "--execution", "aggregate", "--temporal_agg", "true"))
     assert evaluate(package, model, fake_environment(), [0, 5]) == rolled_out(Reacher(), [0, 5], "aggregate")
+
+
+def test_an_alarm_is_logged_once_an_episode_and_travels_with_a_copied_checkpoint(reacher, tmp_path, caplog):
+    file = tmp_path / "policy_best.ckpt"
+    shutil.copy(reacher, file)
+    folder = tmp_path / "policy" / "UGR"
+    write_alarms(file, [Alarm(sha256(file), "2", "reach", "demo_clean", "hash", 40, 0.1, threshold=9.0, steps=3)])
+    robotwin.write_policy(file, folder, execution=2, copy=True)
+    model = robotwin.get_model(settings(folder / file.name, execution=2))
+    silent = robotwin.get_model(settings(reacher, execution=2))
+    assert evaluate(robotwin, model, fake_environment(), [0, 5]) == evaluate(
+        robotwin, silent, fake_environment(), [0, 5]
+    )
+    assert [record.message for record in caplog.records if record.levelname == "WARNING"] == [
+        "alarm in environment 0 at step 4 of its episode"
+    ] * 2
+    assert (model.deployment.alarms, silent.deployment.alarms) == ({0: 4}, {})
+    model.reset_model()
+    environment = fake_environment()
+    environment.setup_demo(0)
+    robotwin.eval(environment, model, environment.get_obs())
+    assert model.deployment.alarms == {}
+    robotwin.write_policy(reacher, folder, execution=2, copy=True)
+    assert not (folder / "policy_best.alarm.json").exists(), "one without an alarm takes the place of one with it"
 
 
 def test_an_exported_folder_is_a_checkpoint_too_and_can_be_copied(tmp_path, monkeypatch):

@@ -27,7 +27,9 @@ from ugr_lightning.contract import Statistics
 from ugr_lightning.data.storage.jpeg import encode_jpeg
 from ugr_lightning.embodiment import image_projection
 from ugr_lightning.errors import CheckpointError, ConfigError, ProtocolError
+from ugr_lightning.models.checkpoint import sha256
 from ugr_lightning.rollout.actors import PolicyActor
+from ugr_lightning.rollout.alarm import Alarm, write_alarms
 
 pytest.importorskip("msgpack", reason="the extra `xpolicylab` is not installed")
 pytest.importorskip("websockets", reason="the extra `xpolicylab` is not installed")
@@ -409,6 +411,24 @@ def test_every_kind_of_request_gets_the_reply_of_its_name(reacher):
         client.connection.send(encode(request("close")))
         with pytest.raises(ConnectionClosed):
             client.connection.recv(timeout=60)
+
+
+def test_replies_tell_of_an_alarm_from_its_step_to_the_end_of_the_episode(reacher, tmp_path, caplog):
+    file = tmp_path / "policy_best.ckpt"
+    file.write_bytes(reacher.read_bytes())
+    write_alarms(file, [Alarm(sha256(file), "2", "reach", "demo_clean", "hash", 40, 0.1, threshold=9.0, steps=3)])
+    with serve(file, execution=2) as server:
+        client, other = Client(server.url), AugustClient(server.url, trial="another")
+        told = [client.ask("infer", {"observation": seen(3, step)}, step=step)["payload"] for step in range(4)]
+        assert [reply.get("alarms") for reply in told] == [None, None, {"3": 4}, {"3": 4}]
+        again = client.ask("call", {"func_name": "get_action", "obs": seen(3, 9)})["payload"]
+        assert again["alarms"] == {"3": 4}
+        assert len(again["result"]) == 2
+        assert "alarms" not in other.ask("call", {"func_name": "infer", "obs": seen(0, 0)})["payload"]
+        assert "alarms" not in client.ask("reset")["payload"]
+        client.close()
+        other.close()
+    assert caplog.text.count("alarm in environment") == 1
 
 
 def test_a_failure_inside_the_policy_is_told_without_its_traceback(reacher, monkeypatch, caplog):

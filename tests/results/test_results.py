@@ -51,6 +51,14 @@ def test_files_from_before_there_were_budgets_are_still_read(tmp_path):
     assert [item.refine_ratio for item in read_results(path)] == [None, 0.5]
 
 
+def test_files_from_before_there_was_an_alarm_are_still_read(tmp_path):
+    path = tmp_path / "r.jsonl"
+    new = ("disagreement", "alarm", "alarm_rate")
+    path.write_text(json.dumps({name: value for name, value in result().to_dict().items() if name not in new}) + "\n")
+    append_result(path, result(1, disagreement=0.5, alarm=3, alarm_rate=0.1))
+    assert [item.alarm for item in read_results(path)] == [None, 3]
+
+
 def test_a_line_cut_off_by_a_crash_goes_with_the_next_one_of_whoever_shares_the_file(tmp_path):
     path = tmp_path / "r.jsonl"
     append_result(path, result(0))

@@ -36,6 +36,12 @@ def test_success_is_marked_and_the_last_step_is_kept():
     assert tuple(frames[0, -1, -1]) == (0, 0, 200)
 
 
+def test_an_alarm_is_marked_from_the_step_on_at_which_it_is_raised():
+    frames = compose_frames(images(), alarm=3, success=[False] * 6 + [True])
+    assert [tuple(frame[-1, -1]) for frame in frames] == [(0, 0, 200)] * 3 + [(220, 40, 40)] * 3 + [(40, 170, 70)]
+    assert (frames[3, :14] != compose_frames(images(), alarm=4)[3, :14]).any(), "and written down"
+
+
 def test_keyframes_glow_where_maps_are_high_and_stand_as_pins_where_the_camera_is_now():
     pictures = [np.full((1, 60, 80, 3), 100, np.uint8)] * 2
     maps = np.zeros((1, 2, 2, 15, 20))

@@ -7,10 +7,8 @@ from ugr_lightning.errors import DataError
 from ugr_lightning.rollout.traces import PredictionTrace
 from ugr_lightning.uncertainty.failure import (
     auroc,
-    conformal_threshold,
     detect_failures,
     overlap_score,
-    running_maximum,
     scores_until,
     uncertainty_score,
 )
@@ -47,21 +45,6 @@ def test_auroc_is_that_of_torchmetrics():
     labels = torch.tensor([1] * 30 + [0] * 50)
     expected = binary_auroc(torch.sigmoid(scores), labels)  # any rising function of the score
     assert auroc(failed, succeeded) == pytest.approx(float(expected), abs=1e-6)
-
-
-def test_a_new_score_exceeds_the_conformal_threshold_as_rarely_as_asked():
-    rng = np.random.default_rng(1)
-    above = [rng.normal() > conformal_threshold(rng.normal(size=19), 0.1) for _ in range(4000)]
-    assert 0.08 < np.mean(above) < 0.12  # exactly 0.1 for 19 scores
-    assert conformal_threshold(np.arange(9.0), 0.1) == 8.0
-    with pytest.raises(DataError, match="at least 9"):
-        conformal_threshold(np.arange(8.0), 0.1)
-
-
-def test_the_maximum_runs_over_a_moving_average():
-    scores = np.array([0.0, 3, 0, 0, 6, 6, 0])
-    assert running_maximum(scores, 2).tolist() == [-np.inf, 1.5, 1.5, 1.5, 3, 6, 6]
-    assert running_maximum(np.array([2.0]), 5).tolist() == [2]
 
 
 def test_only_queries_in_time_and_the_near_steps_of_a_chunk_count():

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from ugr_lightning.errors import ConfigError
+from ugr_lightning.rollout.alarm import alarms_path
 from ugr_lightning.system.files import publish, publish_folder, publish_text
 
 MARK = "Written by `ugr bridge"
@@ -87,4 +88,9 @@ def _place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mappin
         publish_folder(place, write)
     else:
         publish(place, lambda aside: shutil.copyfile(checkpoint, aside))
+        ours, theirs = alarms_path(checkpoint), alarms_path(place)
+        theirs.unlink(missing_ok=True)
+        if ours.is_file():
+            publish(theirs, lambda aside: shutil.copyfile(ours, aside))
+            written.append(theirs)
     return [*written, place]

@@ -1,5 +1,6 @@
 """A trained policy that acts in environments of other projects: named pictures and joints in, commands out."""
 
+import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,9 @@ from ugr_lightning.models.device import chosen_device
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.rollout.actors import PolicyActor
+from ugr_lightning.rollout.alarm import read_alarms
 
+logger = logging.getLogger(__name__)
 WHOLE_CHUNKS = "chunk"
 """The execution that plays every chunk to its end."""
 INTRINSIC, EXTRINSIC = ((3, 3),), ((3, 4), (4, 4))
@@ -55,8 +58,12 @@ class Deployment:
         device: where the policy computes; `auto` takes a GPU where there is one.
         refine_ratio: share of each chunk that is refined, in place of the one in training.
 
+    Attributes:
+        alarms: by slot the control step of the first alarm of its episode; also in the log. See `ugr alarm`.
+
     Raises:
-        CheckpointError: not a usable checkpoint; or one without normalisation statistics or size of the pictures.
+        CheckpointError: not a usable checkpoint; one without normalisation statistics or size of the pictures; or the
+            alarm beside it is another's.
         ConfigError: an execution or a device that does not exist, or a camera without a name in the environment.
 
     Source: RoboTwin-Platform/RoboTwin@13c3c47, policy/ACT/act_policy.py (aggregation).
@@ -85,9 +92,11 @@ class Deployment:
         if refine_ratio is not None:
             policy = with_refine_ratio(policy, refine_ratio)
         policy = policy.to(chosen_device(device)).for_inference()
-        self._actor = PolicyActor(policy, cameras=policy.cameras, refine_ratio=refine_ratio)
+        alarms = read_alarms(self.info.path, self.info.sha256)
+        self._actor = PolicyActor(policy, cameras=policy.cameras, refine_ratio=refine_ratio, alarms=alarms)
         self._actor.begin(slots, policy.chunk_length if execution == WHOLE_CHUNKS else execution)
         self._begins = set(range(slots))
+        self.alarms: dict[int, int] = {}
         self._planned: dict[int, np.ndarray] = {}  # by slot the actions (n, A) that need no other frame
 
     def __str__(self) -> str:
@@ -95,7 +104,7 @@ class Deployment:
         trained = self.info.data.get("task", "an unknown task")
         return (
             f"{self._actor.name} of {self.info.path} (sha256 {self.info.sha256[:12]}), trained on {trained}, "
-            f"execution {self._actor.execution}, pictures {height}x{width}"
+            f"execution {self._actor.execution}, pictures {height}x{width}, alarm {self._actor.alarm or 'none'}"
         )
 
     def begin(self, slot: int) -> None:
@@ -157,10 +166,14 @@ class Deployment:
         for slot in self._begins & set(seen):
             self._actor.start(slot, 0, seen[slot])
             self._planned.pop(slot, None)
+            self.alarms.pop(slot, None)
         self._begins -= set(seen)
         asking = {slot: sight for slot, sight in seen.items() if not len(self._planned.get(slot, ()))}
         for slot, decision in self._actor.act(asking).items():
             self._planned[slot] = _finite(decision.actions, slot)
+            if decision.alarm is not None and slot not in self.alarms:
+                self.alarms[slot] = decision.alarm
+                logger.warning("alarm in environment %d at step %d of its episode", slot, decision.alarm)
         steps = min(len(self._planned[slot]) for slot in seen)
         commands = {slot: self._planned[slot][:steps] for slot in seen}  # (n, A)
         self._planned |= {slot: self._planned[slot][steps:] for slot in seen}

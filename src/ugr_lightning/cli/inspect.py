@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.cli.parsing.call import call
-from ugr_lightning.errors import DataError
+from ugr_lightning.errors import CheckpointError, DataError
 
 
 def _inspect(path: str, picture: str | None = None) -> int:
@@ -54,6 +54,7 @@ def _checkpoint(path: Path) -> list[str]:
         f"cameras       {', '.join(about['cameras'])}",
         *(f"{name:<13} {value}" for name, value in info.data.items() if name != "split"),
         *(f"split         {part}: {_short(members)}" for part, members in split.items()),
+        *_alarms(path, info.sha256),
         f"versions      {', '.join(f'{name} {number}' for name, number in about['versions'].items())}",
         f"arguments     {json.dumps(about['blueprint']['init_args'])}",
         "statistics and other buffers:",
@@ -61,6 +62,15 @@ def _checkpoint(path: Path) -> list[str]:
     return lines + [
         f"  {name}: {_numbers(buffer)}" for name, buffer in policy.named_buffers() if "backbone" not in name
     ]
+
+
+def _alarms(path: Path, sha256: str) -> list[str]:
+    from ugr_lightning.rollout.alarm import read_alarms
+
+    try:
+        return [f"alarm         {alarm}" for alarm in read_alarms(path, sha256).values()]
+    except CheckpointError as error:
+        return [f"alarm         {error}"]
 
 
 def _short(members: Any) -> str:

@@ -13,6 +13,7 @@ from ugr_lightning.training.runs import resolve_checkpoint
 if TYPE_CHECKING:
     from ugr_lightning.contract import ChunkPolicy
     from ugr_lightning.results.results import EpisodeResult
+    from ugr_lightning.rollout.actors import Actor
 
 ExecutionName = Literal["aggregate", "aggregate-variance", "adaptive"] | int
 EXECUTED_STEPS = 25
@@ -98,7 +99,7 @@ def _rollout(
     results = run_episodes(actor, spec)
     if results[0].video:
         print(f"video: {results[0].video}")
-    return _tell(results)
+    return _tell(results, actor)
 
 
 def _test(
@@ -160,14 +161,18 @@ def _test(
     with Simulators() as simulators:
         for execution in executions or both_executions(policy):
             results += run_episodes(actor, replace(spec, execution=execution), simulators=simulators)
-    return _tell(results)
+    return _tell(results, actor)
 
 
-def _tell(results: Sequence["EpisodeResult"]) -> int:
-    """Print the table; one in which every episode has crashed is no result."""
+def _tell(results: Sequence["EpisodeResult"], actor: "Actor | str") -> int:
+    """Print the table, and what came of alarms; one in which every episode has crashed is no result."""
     from ugr_lightning.results.results import success_table
+    from ugr_lightning.rollout.alarm import alarm_report
 
     print(success_table(results))
+    for alarm in getattr(actor, "alarms", {}).values():
+        if any(item.alarm_rate is not None and item.execution == alarm.execution for item in results):
+            print(alarm_report(alarm, results))
     if all(result.crash is not None for result in results):
         got = f"{len(results)} that crashed, the first with: {results[0].crash}"
         fix = "Mend what it names; where that is the simulator, `ugr doctor` checks it."

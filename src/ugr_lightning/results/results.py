@@ -42,6 +42,10 @@ class EpisodeResult:
         refine_ratio: share of each chunk that was refined, where it was chosen for the rollout; None where it was that
             of the training, and in files from before there was this field.
         queries: chunks that were predicted; None for an actor without chunks, and in files from before this field.
+        disagreement: highest of a chunk with earlier ones, see `rollout.overlap`; 0 where none overlapped, None for an
+            actor without chunks and in files from before this field.
+        alarm: control step of the first alarm; None where none was raised.
+        alarm_rate: share of successes, at most, in which the alarm is raised that watched; None where none did.
     """
 
     task: str
@@ -61,6 +65,9 @@ class EpisodeResult:
     crash: str | None = None
     refine_ratio: float | None = None
     queries: int | None = None
+    disagreement: float | None = None
+    alarm: int | None = None
+    alarm_rate: float | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain containers, ready for JSON."""

@@ -1,5 +1,6 @@
 """What can act in the simulator: a policy, and the dummies `zero`, `random` and `expert` to compare it with."""
 
+import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Literal, NamedTuple, Protocol
@@ -11,6 +12,8 @@ from ugr_lightning.contract import CAMERAS, ChunkPolicy, Observation
 from ugr_lightning.embodiment import last_of_each_arm
 from ugr_lightning.errors import CheckpointError
 from ugr_lightning.rollout.aggregation import Execution, make_execution
+from ugr_lightning.rollout.alarm import Alarm, Watch
+from ugr_lightning.rollout.overlap import action_unit
 
 ROWS = 4
 """Rows of a whole query; fewer would make poor use of a processor, more would often be idle."""
@@ -50,6 +53,8 @@ class Decision(NamedTuple):
         maps: (V, 2, 2, h, w) where each camera saw the hands' next keyframes in this step, see `Chunk`; zero for
             cameras that the policy does not look through, None where it does not look for keyframes.
         points: (2, 2, 3) these points in the world, m.
+        disagreement: of that chunk with earlier ones, see `near_disagreement`; 0 where it overlaps with none.
+        alarm: control step of the episode at which it was first raised, see `Alarm`; None before.
     """
 
     actions: np.ndarray | None
@@ -57,6 +62,8 @@ class Decision(NamedTuple):
     log_variance: np.ndarray | None = None
     maps: np.ndarray | None = None
     points: np.ndarray | None = None
+    disagreement: float | None = None
+    alarm: int | None = None
 
 
 NOTHING = Decision(None)
@@ -71,6 +78,7 @@ class Actor(ABC):
         cameras: the pictures it needs; without any the simulators do not render.
         refine_ratio: share of each chunk that is refined, where that is not as in training.
         checkpoint: SHA-256 of the checkpoint that acts, or None.
+        alarm: what raises an alarm in this run, or None.
         rows: for how many slots it likes to decide at once; no more are given to it.
     """
 
@@ -78,6 +86,7 @@ class Actor(ABC):
     execution: str = "1"
     refine_ratio: float | None = None
     checkpoint: str | None = None
+    alarm: Alarm | None = None
     cameras: tuple[str, ...] = ()
     rows: int = 1
 
@@ -170,6 +179,7 @@ class PolicyActor(Actor):
         refine_ratio: share of each chunk that the policy refines, where that is not as in its training; for results.
         checkpoint: SHA-256 of its checkpoint; for results.
         control_hz: actions per second of the data it was trained on; None where nobody knows.
+        alarms: by execution what raises an alarm; for the refinement of its training.
 
     Raises:
         CheckpointError: the policy needs a camera that is not there.
@@ -187,6 +197,7 @@ class PolicyActor(Actor):
         refine_ratio: float | None = None,
         checkpoint: str | None = None,
         control_hz: float | None = None,
+        alarms: Mapping[str, Alarm] | None = None,
     ) -> None:
         unknown = [camera for camera in policy.cameras if camera not in cameras]
         if unknown:
@@ -194,7 +205,7 @@ class PolicyActor(Actor):
             raise CheckpointError("policy.cameras", f"cameras among {', '.join(cameras)}", ", ".join(unknown), fix)
         self.policy, self.state, self.refine_ratio = policy, state, refine_ratio
         self.name, self.checkpoint, self.control_hz = name or type(policy).__name__, checkpoint, control_hz
-        self.cameras = tuple(policy.cameras)
+        self.cameras, self.alarms = tuple(policy.cameras), alarms or {}
         self._views, self._present = [list(cameras).index(camera) for camera in self.cameras], len(cameras)
         self._execution: Execution | None = None
         self._was_training = False
@@ -204,6 +215,11 @@ class PolicyActor(Actor):
         policy = self.policy
         self._execution = make_execution(execution, policy.chunk_length, policy.action_dim, slots)
         self.execution = self._execution.name
+        self.alarm = self.alarms.get(self.execution) if self.refine_ratio is None else None
+        if self.alarms and self.alarm is None:
+            fix = "it was set for the refinement of the training and execution " + ", ".join(self.alarms)
+            warnings.warn(f"No alarm with execution {self.execution}: {fix}. `ugr alarm` sets others.", stacklevel=2)
+        self._unit, self._watches = action_unit(policy), dict[int, Watch]()
         self._sizes: list[int] | None = None  # numbers of rows that a query may have
         self._state = torch.zeros(slots, policy.observation_steps, policy.state_dim)  # (B, T, S), oldest first
         self._images: torch.Tensor | None = None
@@ -220,6 +236,7 @@ class PolicyActor(Actor):
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
         assert self._execution is not None
         self._execution.reset(slot)
+        self._watches[slot] = Watch(self.policy.chunk_length, self._unit, self.alarm)
         self._new.add(slot)
 
     def act(self, frames: Mapping[int, FrameView]) -> dict[int, Decision]:
@@ -232,7 +249,14 @@ class PolicyActor(Actor):
         for slot, answer in predicted.items():
             assert answer.chunk is not None
             self._execution.push(slot, answer.chunk, answer.log_variance)
-        return {slot: predicted.get(slot, NOTHING)._replace(actions=self._known(slot)) for slot in frames}
+            watch = self._watches[slot]
+            predicted[slot] = answer._replace(disagreement=watch.see(answer.chunk), alarm=watch.raised)
+        decisions = {}
+        for slot in frames:
+            actions = self._known(slot)  # (n, A)
+            self._watches[slot].step += len(actions)
+            decisions[slot] = predicted.get(slot, NOTHING)._replace(actions=actions)
+        return decisions
 
     def _known(self, slot: int) -> np.ndarray:
         """Actions (n, A) after which comes the first frame that will be among the observations of a query."""

@@ -16,6 +16,7 @@ from ugr_lightning.models.device import chosen_device
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.results.results import EpisodeResult, append_result, drop_cut_off_line, read_results
 from ugr_lightning.rollout.actors import DUMMIES, Actor, PolicyActor
+from ugr_lightning.rollout.alarm import read_alarms
 from ugr_lightning.rollout.film import write_video
 from ugr_lightning.rollout.loop import ClosedLoop
 from ugr_lightning.rollout.simulators import Simulators
@@ -126,7 +127,7 @@ def checkpoint_actor(
         device: where it computes; `auto` is the GPU where there is one.
 
     Raises:
-        CheckpointError: it was trained for another robot or other cameras.
+        CheckpointError: it was trained for another robot or other cameras, or the alarm beside it is another's.
         ConfigError: a budget that the policy does not have, or no such device.
     """
     require_fit(policy, task)
@@ -141,6 +142,7 @@ def checkpoint_actor(
         refine_ratio=refine_ratio,
         checkpoint=info.sha256,
         control_hz=data.get("control_hz"),
+        alarms=read_alarms(info.path, info.sha256),
     )
 
 
@@ -216,6 +218,9 @@ def _result(episode: RunningEpisode, crash: str | None, actor: Actor, spec: Roll
         video=None if filmed is None else str(filmed),
         crash=crash,
         queries=queries or None,
+        disagreement=episode.trace.disagreement,
+        alarm=episode.trace.alarm,
+        alarm_rate=None if actor.alarm is None else actor.alarm.rate,
     )
 
 

@@ -12,7 +12,7 @@ from ugr_lightning.errors import ConfigError
 from ugr_lightning.system.files import publish
 
 STRIP_HEIGHT = 12
-SUCCESS_COLOUR, TEXT_COLOUR = (40, 170, 70), (255, 255, 255)
+SUCCESS_COLOUR, ALARM_COLOUR, TEXT_COLOUR = (40, 170, 70), (220, 40, 40), (255, 255, 255)
 CERTAIN = 0.1
 """Probability of a cell of a map from which on it is drawn at full strength."""
 
@@ -22,15 +22,17 @@ def compose_frames(
     *,
     log_variance: Sequence[np.ndarray | None] | None = None,
     success: Sequence[bool] | None = None,
+    alarm: int | None = None,
     every: int = 1,
 ) -> np.ndarray:
-    """Put the cameras of each step side by side and write the step, success and s_k on them.
+    """Put the cameras of each step side by side and write the step, success, alarm and s_k on them.
 
     Args:
         images: per step (V, H, W, 3) uint8 RGB.
         log_variance: per step the s_k (K,) of the newest chunk, None where there is none yet; drawn as a strip below
             the pictures, k from left to right, dark certain and bright uncertain over the episode's range.
         success: per step whether the task's condition has been met.
+        alarm: step from which on an alarm is raised, or None.
         every: keep every n-th step; the last one always.
 
     Returns:
@@ -44,11 +46,12 @@ def compose_frames(
         picture = Image.fromarray(np.concatenate(list(images[step]), axis=1))  # (H, V W, 3)
         drawing = ImageDraw.Draw(picture)
         done = bool(success[step]) if success is not None else False
-        drawing.text(
-            (3, 1), f"{step}{'  success' if done else ''}", fill=TEXT_COLOUR, stroke_width=1, stroke_fill=(0, 0, 0)
-        )
-        if done:
-            drawing.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=SUCCESS_COLOUR, width=2)
+        alarmed = alarm is not None and step >= alarm
+        said = f"{step}{'  alarm' if alarmed else ''}{'  success' if done else ''}"
+        drawing.text((3, 1), said, fill=TEXT_COLOUR, stroke_width=1, stroke_fill=(0, 0, 0))
+        if done or alarmed:
+            colour = SUCCESS_COLOUR if done else ALARM_COLOUR
+            drawing.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=colour, width=2)
         frame = np.asarray(picture)
         if known and log_variance is not None:
             frame = np.concatenate([frame, _strip(log_variance[step], frame.shape[1], float(low), float(high))])

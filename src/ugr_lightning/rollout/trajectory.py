@@ -25,6 +25,8 @@ class EpisodeTrace:
         images: N + 1 items (V, H, W, 3) uint8 of a filmed episode, else empty.
         maps, points: N items of a filmed episode, where the policy saw the hands' next keyframes or None, see
             `Decision`; else empty.
+        disagreement: highest of a chunk with earlier ones so far; None where no chunk was predicted.
+        alarm: control step of the first alarm, or None.
     """
 
     frames: list[Frame] = field(default_factory=list)
@@ -34,17 +36,20 @@ class EpisodeTrace:
     images: list[np.ndarray] = field(default_factory=list)
     maps: list[np.ndarray | None] = field(default_factory=list)
     points: list[np.ndarray | None] = field(default_factory=list)
+    disagreement: float | None = None
+    alarm: int | None = None
 
     def motion_hash(self) -> str:
         """SHA-256 of the measured joints of all frames."""
         return hashlib.sha256(b"".join(frame.measured.tobytes() for frame in self.frames)).hexdigest()
 
     def video(self, every: int = 1) -> np.ndarray:
-        """The filmed pictures with step, success, uncertainty and keyframes drawn in, (T, H', W', 3) uint8."""
+        """The filmed pictures with step, success, alarm, uncertainty and keyframes drawn in, (T, H', W', 3) uint8."""
         return compose_frames(
             draw_keyframes(self.images, self.maps, _held(self.points), [frame.projection for frame in self.frames]),
             log_variance=_held(self.log_variance)[: len(self.images)],
             success=[bool(frame.success) for frame in self.frames],
+            alarm=self.alarm,
             every=every,
         )
 
@@ -115,5 +120,8 @@ class RunningEpisode:
                 if self.filmed:
                     self.trace.maps.append(None if step else decision.maps)
                     self.trace.points.append(None if step else decision.points)
+        if decision is not None and decision.disagreement is not None:
+            self.trace.disagreement = max(decision.disagreement, self.trace.disagreement or 0.0)
+            self.trace.alarm = decision.alarm
         self.horizon, self.control_hz = reply.horizon, reply.control_hz
         self.simulate += reply.seconds

@@ -16,6 +16,7 @@ from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.transformer import Dropout, drop
 from ugr_lightning.results.tables import Cells
+from ugr_lightning.rollout.overlap import Overlap
 from ugr_lightning.uncertainty import calibration as kit
 from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, batches
 
@@ -72,21 +73,18 @@ def disagreement(actions: np.ndarray, episode: np.ndarray, step: np.ndarray) -> 
 
     Args:
         actions: (n, K, A), in units in which distances mean something.
-        episode, step: (n,) where each chunk was predicted.
+        episode, step: (n,) where each chunk was predicted; of an episode in the order of its steps.
 
     Returns:
         (n, K) root mean square distance to the earlier predictions; NaN where there are none: in an episode's first
         chunk, and at the end of every chunk.
     """
-    n, K, _ = actions.shape
-    total, count = np.zeros((n, K)), np.zeros((n, K))
-    for now in range(n):
-        for before in np.flatnonzero((episode == episode[now]) & (step < step[now]) & (step > step[now] - K)):
-            shift = step[now] - step[before]
-            distance = np.square(actions[now, : K - shift] - actions[before, shift:]).sum(-1)  # (K - shift,)
-            total[now, : K - shift] += distance
-            count[now, : K - shift] += 1
-    return np.sqrt(np.divide(total, count, out=np.full((n, K), np.nan), where=count > 0))
+    overlaps: dict[int, Overlap] = {}
+    found = np.empty(actions.shape[:2])
+    for row, (number, now, chunk) in enumerate(zip(episode.tolist(), step.tolist(), actions, strict=True)):
+        overlap = overlaps.setdefault(number, Overlap(actions.shape[1], np.ones(actions.shape[2])))
+        found[row] = overlap.push(now, chunk)
+    return found
 
 
 def estimate(

@@ -12,12 +12,10 @@ import numpy as np
 from scipy.stats import mannwhitneyu
 
 from ugr_lightning.errors import DataError
+from ugr_lightning.rollout.alarm import conformal_threshold
+from ugr_lightning.rollout.overlap import HORIZON, Overlap, near_disagreement
 from ugr_lightning.rollout.traces import PredictionTrace
 from ugr_lightning.uncertainty.calibration import Interval
-from ugr_lightning.uncertainty.estimators import disagreement
-
-HORIZON = 10
-"""Steps of a chunk that a step's score looks ahead."""
 
 Score = Callable[[PredictionTrace], np.ndarray]
 """What an alarm goes by: (Q,), a number for each query, higher where more trouble is expected; NaN if unknown."""
@@ -61,18 +59,17 @@ def uncertainty_score(trace: PredictionTrace) -> np.ndarray:
     return trace.log_variance[:, :HORIZON].mean(1)
 
 
-def overlap_score(std: np.ndarray) -> Score:
+def overlap_score(unit: np.ndarray) -> Score:
     """How far the first steps of a chunk are from what earlier chunks said about the same moments; any policy has it.
 
     Args:
-        std: (A,) standard deviation of the actions.
+        unit: (A,) what a distance of 1 is in each action, see `action_unit`.
     """
 
     def score(trace: PredictionTrace) -> np.ndarray:
-        chunks = trace.chunks.astype(np.float64) / std  # (Q, K, A)
-        distance = disagreement(chunks, np.zeros(len(chunks)), trace.query)[:, :HORIZON]  # (Q, HORIZON)
-        known = ~np.isnan(distance)
-        return np.where(known, distance, 0.0).sum(1) / np.where(known.any(1), known.sum(1), np.nan)  # (Q,)
+        overlap = Overlap(trace.chunks.shape[1], unit)
+        asked = zip(trace.query, trace.chunks, strict=True)
+        return np.array([near_disagreement(overlap.push(step, chunk)) for step, chunk in asked])  # (Q,)
 
     return score
 
@@ -92,38 +89,6 @@ def scores_until(trace: PredictionTrace, score: Score, until: int) -> tuple[np.n
     values = score(trace)
     counts = (trace.query < until) & ~np.isnan(values)
     return trace.query[counts], values[counts]
-
-
-def running_maximum(scores: np.ndarray, window: int = 5) -> np.ndarray:
-    """Highest average of `window` queries so far, (Q,), -inf before the first: a single uncertain query is no alarm."""
-    if not len(scores):
-        return np.empty(0)
-    width = min(window, len(scores))
-    smooth = np.convolve(scores, np.ones(width) / width, mode="valid")  # (Q - width + 1,)
-    return np.maximum.accumulate(np.concatenate([np.full(width - 1, -np.inf), smooth]))
-
-
-def conformal_threshold(scores: np.ndarray, level: float = 0.1) -> float:
-    """The threshold that a new score of the same kind exceeds with at most a given probability.
-
-    Args:
-        scores: (n,) highest scores of successful episodes.
-        level: that probability.
-
-    Returns:
-        The ceil((n + 1) (1 - level))-th smallest score.
-
-    Raises:
-        DataError: too few episodes for the level.
-
-    Source: Vovk et al. (2005), split conformal prediction.
-    """
-    rank = math.ceil((len(scores) + 1) * (1 - level) - 1e-9)
-    if rank > len(scores):
-        least = math.ceil(1 / level) - 1
-        fix = "Roll out more episodes, or allow more false alarms."
-        raise DataError("successful episodes", f"at least {least} for a level of {level:g}", len(scores), fix)
-    return float(np.sort(scores)[rank - 1])
 
 
 def auroc(failed: np.ndarray, succeeded: np.ndarray) -> float:
@@ -165,7 +130,7 @@ def detect_failures(
     order = rng.permutation(len(good))
     half = len(good) // 2
     scored = [[scores_until(trace, score, until) for trace in part] for part in (good, bad)]
-    paths = [[running_maximum(values) for _, values in part] for part in scored]
+    paths = [[np.maximum.accumulate(values) for _, values in part] for part in scored]
     highest_good, highest_bad = (np.array([path[-1] if len(path) else -np.inf for path in part]) for part in paths)
     threshold = conformal_threshold(highest_good[order[:half]], level)
     held_out = highest_good[order[half:]]

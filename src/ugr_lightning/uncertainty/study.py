@@ -16,6 +16,7 @@ from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.results.tables import Cells, as_markdown, as_text
+from ugr_lightning.rollout.overlap import action_unit
 from ugr_lightning.rollout.traces import read_traces
 from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
@@ -26,7 +27,7 @@ from ugr_lightning.uncertainty.estimators import estimate, estimator_table
 from ugr_lightning.uncertainty.events import KINDS, find_events
 from ugr_lightning.uncertainty.failure import Alarms, Score, detect_failures, overlap_score, uncertainty_score
 from ugr_lightning.uncertainty.foretold import foretold, foretold_table
-from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, predict
+from ugr_lightning.uncertainty.predictions import Predictions, predict
 
 
 @dataclass
@@ -208,8 +209,8 @@ def add_failures(study: Study, folder: Path) -> None:
     if not groups:
         fix = "Make some with `ugr rollout CHECKPOINT --seeds selection --traces FOLDER`."
         raise DataError(folder, "traces of this checkpoint", "none", fix)
-    std = study.data.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
-    scores: dict[str, Score] = {"s_k": uncertainty_score, "overlapping chunks": overlap_score(std)}
+    overlap = overlap_score(action_unit(study.policy))
+    scores: dict[str, Score] = {"s_k": uncertainty_score, "overlapping chunks": overlap}
     if study.validation.log_variance is None:
         del scores["s_k"]
     found: dict[str, Alarms] = {}

@@ -205,6 +205,12 @@ class XPolicyModel:
     def _observed_last(self, session: Hashable, client: Hashable) -> list[int]:
         return self._latest.get((session, client), self._latest.get((session, None), []))
 
+    def alarms(self, session: Hashable) -> dict[str, int]:
+        """By number of a client's environment the control step of the first alarm of its episode."""
+        known = self.deployment.alarms
+        of_client = {str(index): one.slot for (whose, index), one in self._environments.items() if whose == session}
+        return {index: known[slot] for index, slot in of_client.items() if slot in known}
+
     def prepare_case(self, case_meta: Any = None) -> None:
         """Nothing to prepare."""
 

@@ -146,7 +146,9 @@ class PolicyServer:
 
     def _reply(self, frame: Message, client: Hashable) -> Message:
         try:
-            return frame.reply(REPLIES[frame.message_type], self._payload(frame, client))
+            payload = self._payload(frame, client)
+            alarms = self.model.alarms(frame.session)
+            return frame.reply(REPLIES[frame.message_type], {**payload, "alarms": alarms} if alarms else payload)
         except UGRError as error:
             return _error(frame, FAILURES.get(frame.message_type, INTERNAL), str(error))
         except Exception:  # whatever it is, the client learns that it happened and the log what it was
