@@ -15,17 +15,16 @@ from torch.utils.flop_counter import FlopCounterMode
 from ugr_lightning.contract import ACTION_DIM, CAMERAS, STATE_DIM, Batch, Statistics
 from ugr_lightning.data.chunks import ChunkDataset
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import episode_path
-from ugr_lightning.data.formats.robotwin import read_episode, write_episode
+from ugr_lightning.data.formats.robotwin import read_episode
 from ugr_lightning.data.storage.cache import Cache, open_frames
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.precision import autocast
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.sim.registry import open_simulator
+from ugr_lightning.speed.made_up import TASK, write_made_up
 from ugr_lightning.speed.reference_act import ReferenceACT
 from ugr_lightning.system.workers import Worker, start_all
 
-TASK = "click_alarmclock"
 EPISODE_TIMEOUT_S = 600.0
 
 
@@ -150,14 +149,10 @@ def measure_compact_step(size: Size) -> Iterator[Measurement]:
     torch.manual_seed(0)
     policy = ACT(refine=Uncertainty(), **{**COMPACT, **size.act})
     policy.set_statistics(_statistics())
-    batch, factor = _batch(size), torch.randn(1024, 1024)
-    optimizer = torch.optim.AdamW(policy.parameters(), lr=3e-4, weight_decay=1e-4, fused=True)
+    batch, factor, optimizer = _batch(size), torch.randn(1024, 1024), compact_optimizer(policy)
 
     def step() -> None:
-        optimizer.zero_grad()
-        policy.losses(batch)["loss"].backward()
-        torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
-        optimizer.step()
+        compact_step(policy, optimizer, batch)
 
     def multiply() -> None:
         with torch.no_grad(), autocast(policy.precision, factor.device):
@@ -169,6 +164,19 @@ def measure_compact_step(size: Size) -> Iterator[Measurement]:
     products = counter.get_total_flops() / (2 * 1024**3)  # as many as the step has operations
     paces["reference"] = Pace(*(products * seconds for seconds in paces.pop("product")))
     yield _slower_is_worse(f"compact training step, {_describe(size)}", paces, "reference: its arithmetic alone")
+
+
+def compact_optimizer(policy: ACT) -> torch.optim.Optimizer:
+    """The optimiser of `configs/compact.yaml`."""
+    return torch.optim.AdamW(policy.parameters(), lr=3e-4, weight_decay=1e-4, fused=True)
+
+
+def compact_step(policy: ACT, optimizer: torch.optim.Optimizer, batch: Batch) -> None:
+    """A training step as `configs/compact.yaml` takes it."""
+    optimizer.zero_grad()
+    policy.losses(batch)["loss"].backward()
+    torch.nn.utils.clip_grad_norm_(policy.parameters(), 10.0)
+    optimizer.step()
 
 
 def measure_query(size: Size) -> Iterator[Measurement]:
@@ -199,7 +207,8 @@ def measure_data(size: Size) -> Iterator[Measurement]:
     torch.set_num_threads(1)
     try:
         with tempfile.TemporaryDirectory() as folder:
-            episodes = [_record(Path(folder), index, size) for index in range(2)]
+            paths = [write_made_up(Path(folder), index, size.frames, size.image_size) for index in range(2)]
+            episodes = list(map(read_episode, paths))
             caches: tuple[Cache, ...] = ("ram", "memmap", "none")
             fetch: dict[str, Callable[[], None]] = {cache: _fetch(episodes, cache, size) for cache in caches}
             paces = take_turns(fetch, size.rounds)
@@ -290,35 +299,6 @@ def _batch(size: Size) -> Batch:
     actions = torch.randn(size.batch, 50, ACTION_DIM, generator=generator)
     index = torch.arange(size.batch)
     return Batch(images, state, actions, torch.ones(size.batch, 50, dtype=torch.bool), index, index)
-
-
-def _record(folder: Path, index: int, size: Size) -> Episode:
-    """Write and read an episode of smooth random pictures, whose JPEGs are as costly as those of a scene."""
-    generator = np.random.default_rng(index)
-    height, width = size.image_size
-    coarse = generator.integers(256, size=(size.frames + 1, len(CAMERAS), height // 8, width // 8, 3), dtype=np.uint8)
-    images = coarse.repeat(8, axis=2).repeat(8, axis=3)  # (frames + 1, V, H, W, 3)
-    joints = generator.standard_normal((size.frames + 1, STATE_DIM)).astype(np.float32)
-    shapes = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
-    camera = {key: np.eye(*shape) for key, shape in shapes.items()}
-    path = episode_path(folder, index)
-    write_episode(
-        path,
-        images=images,
-        commanded=joints,
-        measured=joints,
-        endpose=np.zeros((size.frames + 1, 2, 7)),
-        contacts=np.zeros((size.frames + 1, 2), bool),
-        expert_action=joints[1:],
-        phase=["bench"] * size.frames,
-        slack=np.zeros(size.frames, np.float32),
-        camera_parameters=dict.fromkeys(CAMERAS, camera),
-        task=TASK,
-        setting="demo_clean",
-        seed=index,
-        control_hz=25.0,
-    )
-    return read_episode(path)
 
 
 def _fetch(episodes: list[Episode], cache: Cache, size: Size) -> Callable[[], None]:

@@ -78,9 +78,9 @@ def cells_of(item: Measurement) -> tuple[str, ...]:
     return item.name, f"{_number(item.value)} {item.unit}", cpu, reference, ratio, item.aim
 
 
-def print_cells(cells: Sequence[str]) -> None:
-    """Print a line of the table."""
-    print("  ".join(f"{cell:<{width}}" for cell, width in zip(cells, WIDTHS, strict=True)).rstrip(), flush=True)
+def print_cells(cells: Sequence[str], widths: Sequence[int] = WIDTHS) -> None:
+    """Print a line of a table."""
+    print("  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip(), flush=True)
 
 
 def _number(value: float) -> str:
