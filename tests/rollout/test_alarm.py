@@ -47,8 +47,8 @@ def alarm(execution="2", **more):
     return replace(about, **more)
 
 
-def roll(policy, execution="2", task="reach", alarms=(), slots=2, **more):
-    actor = PolicyActor(policy, alarms={item.execution: item for item in alarms})
+def roll(policy, execution="2", task="reach", alarms=(), slots=2, refine_ratio=None, **more):
+    actor = PolicyActor(policy, alarms={item.execution: item for item in alarms}, refine_ratio=refine_ratio)
     small = {"image_size": (4, 6), "progress": False, "workers": 1, "slots_per_worker": slots}
     return run_episodes(actor, RolloutSpec(task, SEEDS, execution=execution, **small, **more))
 
@@ -74,16 +74,17 @@ def test_an_alarm_is_raised_with_the_first_chunk_that_disagrees_too_much_or_come
     threshold = np.sort(scores[1:])[-2] * 1.01
     first = int(trace.query[np.nanargmax(scores)])
     assert roll(Waverer(), alarms=[alarm(threshold=threshold)])[0].alarm == first
-    late = roll(Waverer(), alarms=[alarm(threshold=9.0, steps=3)])
+    late = roll(Waverer(), alarms=[alarm(threshold=9.0, steps=4)])
     assert [(result.alarm, result.alarm_rate) for result in late] == [(4, 0.1)] * 4
     assert [result.alarm for result in roll(Waverer(), alarms=[alarm(threshold=9.0)])] == [None] * 4
     assert [result.motion_hash for result in late] == [result.motion_hash for result in free]
 
 
 @pytest.mark.usefixtures("fake_tasks")
-def test_an_alarm_for_another_execution_is_not_raised_and_that_is_said():
-    with pytest.warns(UserWarning, match="No alarm with execution 3: it was set for .* execution 2"):
-        results = roll(Waverer(), "3", alarms=[alarm(threshold=0.0, steps=0)])
+@pytest.mark.parametrize(("execution", "refine_ratio"), [("3", None), ("2", 0.5)])
+def test_an_alarm_for_another_execution_or_refinement_is_not_raised_and_that_is_said(execution, refine_ratio):
+    with pytest.warns(UserWarning, match=f"No alarm with execution {execution}: it was set for .* execution 2"):
+        results = roll(Waverer(), execution, alarms=[alarm(threshold=0.0, steps=0)], refine_ratio=refine_ratio)
     assert {(result.alarm, result.alarm_rate) for result in results} == {(None, None)}
 
 
