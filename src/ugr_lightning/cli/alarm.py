@@ -8,7 +8,7 @@ from ugr_lightning.training.runs import resolve_checkpoint
 
 
 def _alarm(checkpoint: str, results: str, rate: float = 0.1, run: str | None = None, root: str = "runs") -> int:
-    """Set the alarm that rollouts and bridges raise where chunks disagree, or an episode lasts, as before failures.
+    """Set the alarm that rollouts and bridges raise where what happens is rare before a success.
 
     Args:
         checkpoint: `best`, `best_loss`, `last`, a checkpoint file, or a folder from `ugr export --to safetensors`.
