@@ -21,7 +21,7 @@ def _speed(
 
     Args:
         parts: what to measure; null means all but `scale`: how costs grow with demonstrations, cameras, pictures,
-            chunk and processes, which takes a quarter of an hour and 8 GB of memory and disk.
+            chunk and processes, which takes a quarter of an hour and 9 GB of memory and disk.
         quick: tiny sizes, to see that everything runs; the numbers then mean nothing.
         threads: torch threads; null for one per core.
         processes: simulators that run side by side.

@@ -198,7 +198,7 @@ def scale_figure(rows: Sequence[Growth]) -> Any:
                 heights = [getattr(point, name) for point in points]
                 known = [math.nan if height is None else height for height in heights]
                 axis.plot([point.value for point in points], known, marker=".", label=line)
-            axis.set_ylim(0)
+            axis.set_ylim(0, 1.1 * axis.get_ylim()[1])
             axis.set_ylabel(label if axis in grid[:, 0] else "")
         axes[0].set_title(varied, fontsize=10)
         if len(lines) > 1:
