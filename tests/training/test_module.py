@@ -3,6 +3,7 @@ import warnings
 
 import pytest
 import torch
+from deployed import looking_act
 from lightning.pytorch import Trainer
 from tiny import TinyData, TinyPolicy, TinySamples, collate, train
 
@@ -126,6 +127,16 @@ def test_a_module_is_made_without_warnings():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         PolicyModule(TinyPolicy())
+
+
+def test_the_backbone_and_the_keyframes_maps_learn_at_a_rate_of_their_own():
+    module = PolicyModule(looking_act(), learning_rate=3e-4, backbone_learning_rate=1e-3)
+    module.trainer = Trainer(**QUIET, logger=False, max_steps=1)
+    names = {id(parameter): name for name, parameter in module.policy.named_parameters()}
+    groups = module.configure_optimizers()["optimizer"].param_groups
+    parts = {group["lr"]: {names[id(one)].partition(".")[0] for one in group["params"]} for group in groups}
+    assert parts[1e-3] == {"backbone", "finder"}
+    assert {"encoder", "decoder", "action_head", "input_proj"} <= parts[3e-4]
 
 
 @pytest.mark.parametrize(

@@ -19,6 +19,9 @@ from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.training.keyframe_error import MedianMetric, event_errors, known_kinematics
 
+SEEING = ("backbone", "finder")
+"""Words in the names of the parameters that see: the backbone and the keyframes' maps."""
+
 
 class PolicyModule(LightningModule):
     """A policy in training: AdamW, a learning-rate schedule and the log.
@@ -26,7 +29,7 @@ class PolicyModule(LightningModule):
     Args:
         policy: the policy to train.
         learning_rate: peak step size of AdamW (paper, section IV-A: 1e-5).
-        backbone_learning_rate: step size of parameters whose name contains `backbone`; null means `learning_rate`.
+        backbone_learning_rate: step size of what sees (backbone, keyframes' maps); null means `learning_rate`.
         weight_decay: AdamW's decoupled weight decay.
         warmup_steps: optimiser steps over which the learning rate rises linearly.
         schedule: what follows the warm-up: `constant`; `cosine` down to a hundredth at the trainer's last step; or
@@ -140,13 +143,14 @@ class PolicyModule(LightningModule):
         return metric
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW with the backbone as a group of its own, and a schedule that counts optimiser steps."""
-        named = [(name, p) for name, p in self.policy.named_parameters() if p.requires_grad]
-        groups = [
-            {"params": [p for name, p in named if "backbone" not in name], "lr": self.learning_rate},
-            {"params": [p for name, p in named if "backbone" in name], "lr": self.backbone_learning_rate},
-        ]
-        groups = [group for group in groups if group["params"]]
+        """AdamW with what sees as a group of its own, and a schedule that counts optimiser steps."""
+        seeing: list[nn.Parameter] = []
+        acting: list[nn.Parameter] = []
+        for name, parameter in self.policy.named_parameters():
+            if parameter.requires_grad:
+                (seeing if any(word in name for word in SEEING) else acting).append(parameter)
+        pairs = ((acting, self.learning_rate), (seeing, self.backbone_learning_rate))
+        groups = [{"params": parameters, "lr": rate} for parameters, rate in pairs if parameters]
         fused = not str(self.trainer.precision).endswith("-mixed")  # Lightning clips no gradients of a fused one then
         optimizer = torch.optim.AdamW(
             groups, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay, fused=fused
