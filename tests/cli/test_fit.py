@@ -229,6 +229,20 @@ def test_weights_without_a_training_cannot_be_gone_on_with(tiny_config, capsys):
     assert "weights only" in capsys.readouterr().err
 
 
+def test_an_optimiser_that_divides_the_parameters_in_another_way_cannot_be_gone_on_with(tiny_config, capsys):
+    fit(tiny_config, "--trainer.max_steps", "3")
+    content = torch.load(RUN / "last.ckpt", weights_only=True)
+    groups = content["optimizer_states"][0]["param_groups"]
+    size = sum(len(group["params"]) for group in groups)
+    groups[:] = [{**groups[0], "params": list(range(size - 1))}, {**groups[0], "params": [size - 1]}]
+    torch.save(content, "other.ckpt")
+    before = sorted(RUN.parent.iterdir())
+    assert main(["fit", "--config", tiny_config, "--checkpoint", "other.ckpt"]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"other.ckpt: expected an optimiser of {size} parameters, got {size - 1} and 1." in said
+    assert sorted(RUN.parent.iterdir()) == before
+
+
 def test_a_log_that_was_cut_off_is_gone_on_with(tiny_config):
     fit(tiny_config, "--trainer.max_steps", "3")
     log = RUN / "metrics.csv"

@@ -249,7 +249,7 @@ class UGRCLI(LightningCLI):
         if content is None or not _is_first_process():
             return
         path = Path(self._get(self.config, "checkpoint"))
-        check_training(path, content)
+        check_training(path, content, self.model.policy)
         self.datamodule.prepare_data()
         self.datamodule.setup("fit")
         check_data(path, content, self.model.policy, self.datamodule)

@@ -23,6 +23,15 @@ SEEING = ("backbone", "finder")
 """Words in the names of the parameters that see: the backbone and the keyframes' maps."""
 
 
+def acting_and_seeing(policy: ChunkPolicy) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
+    """What is trained of a policy: parameters that learn at `learning_rate`, and those at `backbone_learning_rate`."""
+    parts: tuple[list[nn.Parameter], list[nn.Parameter]] = [], []
+    for name, parameter in policy.named_parameters():
+        if parameter.requires_grad:
+            parts[any(word in name for word in SEEING)].append(parameter)
+    return parts
+
+
 class PolicyModule(LightningModule):
     """A policy in training: AdamW, a learning-rate schedule and the log.
 
@@ -144,13 +153,9 @@ class PolicyModule(LightningModule):
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW with what sees as a group of its own, and a schedule that counts optimiser steps."""
-        seeing: list[nn.Parameter] = []
-        acting: list[nn.Parameter] = []
-        for name, parameter in self.policy.named_parameters():
-            if parameter.requires_grad:
-                (seeing if any(word in name for word in SEEING) else acting).append(parameter)
-        pairs = ((acting, self.learning_rate), (seeing, self.backbone_learning_rate))
-        groups = [{"params": parameters, "lr": rate} for parameters, rate in pairs if parameters]
+        rates = (self.learning_rate, self.backbone_learning_rate)
+        parts = zip(acting_and_seeing(self.policy), rates, strict=True)
+        groups = [{"params": parameters, "lr": rate} for parameters, rate in parts if parameters]
         fused = not str(self.trainer.precision).endswith("-mixed")  # Lightning clips no gradients of a fused one then
         optimizer = torch.optim.AdamW(
             groups, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay, fused=fused

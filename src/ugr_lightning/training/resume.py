@@ -12,6 +12,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from ugr_lightning.contract import ChunkPolicy, Statistics
 from ugr_lightning.errors import CheckpointError
 from ugr_lightning.models.checkpoint import describe
+from ugr_lightning.training.module import acting_and_seeing
 
 HONOURED = (
     *("seed_everything", "model.", "average.", "checkpoints.", "data.batch_size", "data.sampling."),
@@ -45,16 +46,21 @@ def check_weights(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> N
         raise CheckpointError(path, f"the weights of the policy in the config, {expected}", got, fix)
 
 
-def check_training(path: Path, content: dict[str, Any]) -> None:
-    """Make sure that a checkpoint holds a training and not only weights.
+def check_training(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> None:
+    """Make sure that a checkpoint holds a training of such a policy and not only weights.
 
     Raises:
-        CheckpointError: it was imported or exported.
+        CheckpointError: it was imported or exported, or its optimiser divides the parameters in another way.
     """
     missing = [name for name in ("optimizer_states", "lr_schedulers", "loops") if name not in content]
     if missing:
         fix = "It can be rolled out, exported and scored; a training goes on from a checkpoint of `ugr fit` only."
         raise CheckpointError(path, "the state of a training", f"weights only (no {', '.join(missing)})", fix)
+    before = [len(group["params"]) for state in content["optimizer_states"] for group in state["param_groups"]]
+    now = [len(part) for part in acting_and_seeing(policy) if part]
+    if before != now:
+        fix = "It is of another version of this package: go on with that one, or train afresh without --checkpoint."
+        raise CheckpointError(path, f"an optimiser of {_counts(now)} parameters", _counts(before), fix)
 
 
 def check_data(path: Path, content: dict[str, Any], policy: ChunkPolicy, data: Any) -> None:
@@ -147,6 +153,10 @@ def _same(kept: dict[str, Tensor], statistics: Statistics) -> bool:
         name not in kept or (kept[name].shape == value.shape and torch.allclose(kept[name], value, 1e-4, 1e-5))
         for name, value in _tensors(statistics)
     )
+
+
+def _counts(sizes: list[int]) -> str:
+    return " and ".join(map(str, sizes))
 
 
 def _short(value: Any) -> str:
