@@ -27,7 +27,6 @@ def test_a_sweep_tries_budgets_and_executions_on_the_same_selection_seeds(comman
         ("ACT", "aggregate"),
         ("ACT", "aggregate-variance"),
         ("ACT", 10),
-        ("ACT", "adaptive"),
         ("ACT(refine_ratio=0)", "aggregate"),
         ("ACT(refine_ratio=0.5)", "aggregate"),
         ("ACT(refine_ratio=1)", "aggregate"),
@@ -51,7 +50,7 @@ def test_a_sweep_tries_budgets_and_executions_on_the_same_selection_seeds(comman
     assert [use["successes"] for use in found["budgets"]["uses"]] == [10, 10, 10, 0]
     assert found["budgets"]["offline"][0]["against_coarse"]["value"] == 0
     assert found["budgets"]["offline"][3]["against_coarse"]["value"] != 0
-    assert len(read_results(folder / "episodes.jsonl")) == 70
+    assert len(read_results(folder / "episodes.jsonl")) == 60
     assert np.asarray(Image.open(folder / "budgets.png")).std() > 0
 
 
@@ -60,7 +59,7 @@ def test_a_sweep_that_was_stopped_runs_only_what_is_missing(command, world, tmp_
     whole = capsys.readouterr().out
     file = tmp_path / "sweep-policy_best" / "episodes.jsonl"
     lines = file.read_text().splitlines(keepends=True)
-    file.write_text("".join(lines[:53]) + lines[53][:20])
+    file.write_text("".join(lines[:43]) + lines[43][:20])
     world.clear()
     assert main([*command, "--data", "null"]) == 0
     assert [(call["actor"], len(call["seeds"])) for call in world] == [
@@ -94,7 +93,7 @@ def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
     assert main(command) == 2
     assert "ranking" in capsys.readouterr().err
     assert main([*command, "--ratios", "[]"]) == 0
-    assert [call["execution"] for call in world] == ["aggregate", 10, "adaptive"]
+    assert [call["execution"] for call in world] == ["aggregate", 10]
     assert main([*command, "--ratios", "[]", "--executions", "[aggregate-variance]"]) == 2
     assert "log-variance" in capsys.readouterr().err
 
@@ -102,7 +101,7 @@ def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
 def test_a_policy_with_keyframes_is_asked_with_a_calibration(world, tmp_path):
     checkpoint = save(looking_act(), tmp_path / "a.ckpt")
     assert main(["sweep", str(checkpoint), "--episodes", "2", "--ratios", "[]"]) == 0
-    assert [call["execution"] for call in world] == ["aggregate", 10, "adaptive"]
+    assert [call["execution"] for call in world] == ["aggregate", 10]
 
 
 @pytest.mark.parametrize(

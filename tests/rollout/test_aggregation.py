@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from ugr_lightning.errors import ConfigError
-from ugr_lightning.rollout.aggregation import AdaptiveExecution, ChunkExecution, TemporalAggregation, make_execution
+from ugr_lightning.rollout.aggregation import ChunkExecution, TemporalAggregation, make_execution
 
 K, A, T = 7, 3, 25
 
@@ -121,46 +121,3 @@ def test_execution_is_parsed_from_a_word_or_a_number():
     for wrong in ("agregate", 0, K + 1, "-2", "2.5", True):
         with pytest.raises(ConfigError, match="execution"):
             make_execution(wrong, K, A)
-
-
-def horizons(chunks, longest=25, **settings):
-    """How many steps are executed of each chunk of a (Q, K, A) list."""
-    execution = AdaptiveExecution(longest, **settings)
-    executed = []
-    for chunk in chunks:
-        assert execution.needs_query(0)
-        execution.push(0, chunk)
-        executed.append(execution.steps_left(0))
-        taken = [execution.next(0) for _ in range(executed[-1])]
-        assert np.array_equal(taken, chunk[: executed[-1]])
-    return executed
-
-
-def test_more_of_each_chunk_is_executed_the_longer_chunks_agree_and_little_after_they_do_not():
-    still, moved = np.zeros((50, 2), np.float32), np.zeros((50, 2), np.float32)
-    moved[:, 1] = 0.1
-    assert horizons([still, still, still, still, moved, moved, moved]) == [5, 10, 20, 25, 5, 10, 20]
-
-
-def test_chunks_agree_when_they_say_the_same_of_the_same_moments_not_the_same_of_their_first_steps():
-    path = np.linspace(0, 5, 200, dtype=np.float32)[:, None]  # 0.025 a step
-    assert horizons([path[0:50], path[5:55], path[15:65]]) == [5, 10, 20]
-    assert horizons([path[0:50], path[0:50], path[0:50]]) == [5, 5, 5]
-
-
-def test_the_joint_that_is_furthest_away_decides_by_its_mean_over_the_steps_ahead():
-    still, late = np.zeros((50, 14), np.float32), np.zeros((50, 14), np.float32)
-    late[:5, 6] = [0, 0, 0, 0, 1]  # a gripper that closes in the last of five steps
-    assert horizons([still, late], tolerance=0.21) == [5, 10]
-    assert horizons([still, late], tolerance=0.19) == [5, 5]
-
-
-def test_adaptive_execution_leaves_half_of_a_chunk_to_compare_the_next_one_with():
-    execution = make_execution("adaptive", 8)
-    for expected in (4, 4):
-        execution.push(0, np.zeros((8, 3)))
-        assert execution.steps_left(0) == expected
-        for _ in range(expected):
-            execution.next(0)
-    execution.reset(0)
-    assert execution.needs_query(0)

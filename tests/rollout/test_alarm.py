@@ -54,7 +54,7 @@ def roll(policy, execution="2", task="reach", alarms=(), slots=2, refine_ratio=N
 
 
 @pytest.mark.usefixtures("fake_tasks")
-@pytest.mark.parametrize("execution", ["aggregate", "2", "adaptive"])
+@pytest.mark.parametrize("execution", ["aggregate", "2"])
 def test_what_is_seen_while_an_episode_runs_is_what_its_trace_says(tmp_path, execution):
     results = roll(Waverer(), execution, traces=tmp_path)
     for trace, result in zip(read_traces(tmp_path.glob("*.npz")), results, strict=True):

@@ -51,7 +51,7 @@ class Deployment:
         checkpoint: file from `ugr fit`.
         cameras: the policy's name of a camera: the environment's.
         calibration: what the environment calls a camera's intrinsic and its extrinsic matrix.
-        execution: `aggregate`, `aggregate-variance`, `adaptive`, the number of steps executed of each chunk, or `chunk`
+        execution: `aggregate`, `aggregate-variance`, the number of steps executed of each chunk, or `chunk`
             for all.
         slots: how many environments at most.
         image_size: (height, width) that pictures are scaled to; None takes the size of the training.

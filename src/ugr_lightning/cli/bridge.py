@@ -27,7 +27,7 @@ def _robotwin(
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         out: the folder; its name is the policy's. `policy/NAME` of a checkout of the branch `stable_2.0`.
-        execution: `aggregate`; `aggregate-variance`; `adaptive`; or the number of steps executed of each chunk.
+        execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
         cameras: RoboTwin's names of the policy's cameras, where they are not the usual ones.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is.
     """
@@ -58,7 +58,7 @@ def _xpolicylab(
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         out: the folder; its name is the policy's. `policy/NAME` of an XPolicyLab checkout.
-        execution: `aggregate`; `aggregate-variance`; `adaptive`; or the number of steps executed of each chunk.
+        execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
         cameras: XPolicyLab's names of the policy's cameras, where they are not the usual ones.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is.
     """
@@ -96,7 +96,7 @@ def _serve(
         folder: adapter folder written by `ugr bridge xpolicylab`; null serves the checkpoint with the usual settings.
         host: where to listen; the default is reachable from this machine only.
         port: where to listen; 0 takes a free one.
-        execution: `aggregate`; `aggregate-variance`; `adaptive`; or the number of steps executed of each chunk.
+        execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
         bench_name: XPolicyLab's name of the benchmark.
         task_name: XPolicyLab's name of the task.
         ckpt_name: which run, where the folder names no checkpoint.

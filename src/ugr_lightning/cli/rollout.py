@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from ugr_lightning.results.results import EpisodeResult
     from ugr_lightning.rollout.actors import Actor
 
-ExecutionName = Literal["aggregate", "aggregate-variance", "adaptive"] | int
+ExecutionName = Literal["aggregate", "aggregate-variance"] | int
 EXECUTED_STEPS = 25
 """Steps executed of each chunk, at most, where nothing else is asked for; half of a chunk of 50."""
 
@@ -49,9 +49,8 @@ def _rollout(
         task: a name from `ugr tasks`; null takes the task the checkpoint was trained on.
         seeds: `evaluation` (the task's fixed list), `selection` (for choices of a recipe), or the first seed.
         episodes: how many of those seeds; null means 100, or 1 where only a video is asked for.
-        execution: `aggregate`; `aggregate-variance`, which aggregates with the inverse of the predicted variance;
-            `adaptive`, which executes more of each chunk the longer chunks agree; or the number of steps executed of
-            each chunk.
+        execution: `aggregate`; `aggregate-variance`, which aggregates with the inverse of the predicted variance; or
+            the number of steps executed of each chunk.
         setting: `demo_clean` or `demo_randomized`; null takes the checkpoint's.
         image_size: height and width of the pictures; null takes the checkpoint's.
         workers: simulator processes.
@@ -125,7 +124,7 @@ def _test(
         root: folder of all runs.
         task: a name from `ugr tasks`; null takes the task the checkpoint was trained on.
         episodes: how many of the 100 evaluation seeds.
-        executions: each `aggregate`, `aggregate-variance`, `adaptive`, or the number of steps executed of each chunk;
+        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk;
             null means `aggregate` and 25, or the whole chunk where it is shorter.
         workers: simulator processes.
         out: results file; null appends to `evaluation.jsonl` beside the checkpoint.

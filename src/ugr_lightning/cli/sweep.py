@@ -17,7 +17,6 @@ if TYPE_CHECKING:
     from ugr_lightning.contract import ChunkPolicy
 
 VARIANCE: Literal["aggregate-variance"] = "aggregate-variance"
-ADAPTIVE: Literal["adaptive"] = "adaptive"
 
 
 def _sweep(
@@ -45,7 +44,7 @@ def _sweep(
         episodes: how many of those seeds, for each budget and for each execution.
         ratios: budgets as shares of the chunk; 0 and the one of the training are added; null means tenths from 0 to 1,
             `[]` leaves budgets out, for policies that do not rank steps.
-        executions: each `aggregate`, `aggregate-variance`, `adaptive`, or the number of steps executed of each chunk;
+        executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk;
             budgets are compared in the first, the others with it. Null means all that the policy can, 25 steps of them.
         data: folder of the recordings that the policy was trained on (`data.root`, or `data.folder` if it had one),
             for the offline error; null leaves it out.
@@ -115,7 +114,7 @@ def _plan(checkpoint: Path, ratios: list[float] | None, executions: list[Executi
     certain = policy.predict(seen).log_variance is not None
     first, *others = both_executions(policy)
     weighted: list[ExecutionName] = [VARIANCE] if certain else []
-    chosen = executions or [first, *weighted, *others, ADAPTIVE]
+    chosen = executions or [first, *weighted, *others]
     for execution in chosen:
         make_execution(execution, policy.chunk_length)
     if VARIANCE in chosen and not certain:

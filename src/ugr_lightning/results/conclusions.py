@@ -124,7 +124,6 @@ def described_execution(execution: str) -> str:
     known = {
         "aggregate": "aggregated chunks",
         "aggregate-variance": "chunks aggregated with inverse variance",
-        "adaptive": "more of each chunk the longer chunks agree",
     }
     return known.get(execution, f"{execution} steps of each chunk" if execution.isdecimal() else execution)
 

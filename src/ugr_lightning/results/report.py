@@ -21,8 +21,8 @@ class Mode(NamedTuple):
 
     Args:
         setting: scene setting.
-        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), `adaptive`, the number of steps
-            executed of each chunk, or the name that a benchmark gives to executions that differ between policies.
+        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), the number of steps executed
+            of each chunk, or the name that a benchmark gives to executions that differ between policies.
     """
 
     setting: str

@@ -29,8 +29,8 @@ class EpisodeResult:
         policy: what acted: a checkpoint's policy class, with the budget where that was chosen, such as
             `ACT(refine_ratio=0.5)`; or `zero`, `random`, `expert`.
         checkpoint: SHA-256 of the checkpoint file, or None.
-        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), `adaptive` (more of a chunk the
-            longer chunks agree), or the number of steps executed of each chunk.
+        execution: `aggregate`, `aggregate-variance` (aggregated with inverse variance), or the number of steps executed
+            of each chunk.
         success: whether the task's condition was met before the horizon; a crashed episode has False.
         steps: control steps executed.
         first_success_step: first step at which the condition was met, or None.

@@ -95,7 +95,7 @@ class Actor(ABC):
 
         Args:
             slots: number of slots.
-            execution: `aggregate`, `aggregate-variance`, `adaptive` or the number of steps executed of each chunk.
+            execution: `aggregate`, `aggregate-variance` or the number of steps executed of each chunk.
         """
 
     def end(self) -> None:  # noqa: B027 - most have nothing to tidy up

@@ -9,7 +9,6 @@ from ugr_lightning.errors import ConfigError
 
 AGGREGATE = "aggregate"
 AGGREGATE_VARIANCE = "aggregate-variance"
-ADAPTIVE = "adaptive"
 
 
 class Execution(ABC):
@@ -142,60 +141,22 @@ class ChunkExecution(Execution):
         return chunk[self._cursors[slot] - 1]
 
 
-class AdaptiveExecution(ChunkExecution):
-    """Executes more of each chunk the longer chunks agree with each other, and little of one that contradicts the last.
-
-    While a new chunk says what the one before said about the same moments, twice as many steps of it are executed as
-    of that one; where it does not, `shortest` steps, so that the policy looks again soon.
-
-    Args:
-        longest: most steps that are executed of a chunk, at most K.
-        slots: number of environment slots.
-        shortest: fewest.
-        tolerance: mean distance of a joint over the next `shortest` steps, rad, up to which chunks agree; for grippers
-            the share of their opening.
-
-    Source: docs/uncertainty.md (when to look again).
-    """
-
-    def __init__(self, longest: int, slots: int = 1, shortest: int = 5, tolerance: float = 0.03) -> None:
-        super().__init__(longest, slots)
-        self.name = ADAPTIVE
-        self._shortest, self._longest, self._tolerance = min(shortest, longest), longest, tolerance
-        self._horizons = [0] * slots
-
-    def steps_left(self, slot: int) -> int:
-        return 0 if self._chunks[slot] is None else self._horizons[slot] - self._cursors[slot]
-
-    def push(self, slot: int, chunk: np.ndarray, log_variance: np.ndarray | None = None) -> None:
-        """Replace the slot's chunk by a new one (K, A), of which more is executed if it agrees with the old one."""
-        before = self._chunks[slot]
-        said = np.empty((0, chunk.shape[1])) if before is None else before[self._cursors[slot] :][: self._shortest]
-        agrees = (
-            len(said) and np.abs(chunk[: len(said)] - said).mean(0).max() <= self._tolerance
-        )  # (n, A) -> (A,) -> ()
-        self._horizons[slot] = min(2 * self._horizons[slot], self._longest) if agrees else self._shortest
-        super().push(slot, chunk, log_variance)
-
-
 def make_execution(execution: str | int, chunk_length: int, action_dim: int = ACTION_DIM, slots: int = 1) -> Execution:
     """Build what the setting `execution` names.
 
     Args:
-        execution: `aggregate`, `aggregate-variance`, `adaptive`, or the number of steps (1 .. K) executed of a chunk.
+        execution: `aggregate`, `aggregate-variance`, or the number of steps (1 .. K) executed of a chunk.
         chunk_length: K of the policy.
         action_dim: A of the policy.
         slots: number of environment slots.
 
     Raises:
-        ConfigError: none of the four.
+        ConfigError: none of the three.
     """
     if execution in (AGGREGATE, AGGREGATE_VARIANCE):
         return TemporalAggregation(chunk_length, action_dim, slots=slots, by_variance=execution == AGGREGATE_VARIANCE)
-    if execution == ADAPTIVE:
-        return AdaptiveExecution(max(1, chunk_length // 2), slots)  # the rest is there to compare the next chunk with
     text = str(execution).strip()
     if not text.isdigit() or not 1 <= int(text) <= chunk_length:
-        expected = f"`{AGGREGATE}`, `{AGGREGATE_VARIANCE}`, `{ADAPTIVE}` or a number of steps from 1 to {chunk_length}"
+        expected = f"`{AGGREGATE}`, `{AGGREGATE_VARIANCE}` or a number of steps from 1 to {chunk_length}"
         raise ConfigError("execution", expected, execution, "Say how the chunks are to be executed.")
     return ChunkExecution(int(text), slots)

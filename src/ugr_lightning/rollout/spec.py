@@ -20,7 +20,7 @@ class RolloutSpec:
         seeds: one episode each.
         setting: how the surroundings vary.
         image_size: height and width of the pictures; those the policy was trained on.
-        execution: `aggregate`, `aggregate-variance`, `adaptive` or the number of steps executed of each chunk.
+        execution: `aggregate`, `aggregate-variance` or the number of steps executed of each chunk.
         seeds_hash: SHA-256 of the list that the seeds are from; None takes that of `seeds`.
         out: results file, one line per episode is appended; None for none.
         resume: run only the episodes that `out` lacks.

@@ -32,7 +32,7 @@ class RolloutEvaluation(Callback):
     Args:
         every_n_steps: optimiser steps between two rollouts; 0 for never.
         episodes: episodes per rollout.
-        execution: `aggregate`, `aggregate-variance`, `adaptive`, or the number of steps executed of each chunk.
+        execution: `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk.
         workers: simulator processes.
         task: task to roll out; null means that of the data.
         video: log the first episode as an animated GIF.
@@ -44,7 +44,7 @@ class RolloutEvaluation(Callback):
         self,
         every_n_steps: int = 0,
         episodes: int = 10,
-        execution: Literal["aggregate", "aggregate-variance", "adaptive"] | int = "aggregate",
+        execution: Literal["aggregate", "aggregate-variance"] | int = "aggregate",
         workers: int = 2,
         task: str | None = None,
         video: bool = True,
