@@ -70,8 +70,10 @@ def test_curves_have_a_column_for_what_is_varied_and_a_line_for_each_cache():
     rows = [Growth("demonstrations, cache ram", "50", 9.0, 2000.0, 1.5, 1.0), Growth("cameras", "1", 9.0, 900.0, 1.0)]
     rows += [Growth("demonstrations, cache none", str(count), 9.0, 2000.0, 1.0) for count in (50, 500)]
     rows += [Growth("demonstrations, cache ram", "500", refused="too many")]
+    rows.append(Growth("processes", "1", step_ms=9.0))
     figure = scale_figure(rows)
     first, second, *_ = figure.axes
+    assert [axis.get_visible() for axis in figure.axes[2::3]] == [False, True, False], "no empty pictures"
     assert [axis.get_title() for axis in (first, second)] == ["demonstrations", "cameras"]
     ram, none = first.get_lines()
     assert (ram.get_label(), none.get_label()) == ("cache ram", "cache none")

@@ -199,8 +199,10 @@ def scale_figure(rows: Sequence[Growth]) -> Any:
                 known = [math.nan if height is None else height for height in heights]
                 axis.plot([point.value for point in points], known, marker=".", label=line)
             axis.set_ylim(0, 1.1 * axis.get_ylim()[1])
+            axis.set_visible(any(getattr(point, name) is not None for points in lines.values() for point in points))
             axis.set_ylabel(label if axis in grid[:, 0] else "")
-        axes[0].set_title(varied, fontsize=10)
+        shown = [axis for axis in axes if axis.get_visible()]
+        (shown or axes)[0].set_title(varied, fontsize=10)
         if len(lines) > 1:
             axes[0].legend(fontsize=8)
     return figure
