@@ -1,5 +1,7 @@
+import json
+import math
 import warnings
-from dataclasses import replace
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -155,7 +157,10 @@ def test_alarms_are_kept_beside_their_checkpoint_and_refused_beside_another(tmp_
     assert file.read_bytes() == b"weights"
 
 
-@pytest.mark.parametrize("content", ["", '[{"rate": 1}]', "[1]", "7"])
+NO_NUMBER = json.dumps([asdict(alarm("2", threshold=math.nan))])
+
+
+@pytest.mark.parametrize("content", ["", '[{"rate": 1}]', "[1]", "7", NO_NUMBER])
 def test_a_damaged_file_of_alarms_is_named(tmp_path, content):
     (tmp_path / "a.alarm.json").write_text(content)
     with pytest.raises(CheckpointError, match=r"a\.alarm\.json"):

@@ -173,12 +173,13 @@ def read_alarms(checkpoint: Path, sha256: str) -> dict[str, Alarm]:
         return {}
     try:
         alarms = [Alarm(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
-        found = {alarm.execution: alarm for alarm in alarms if math.isfinite(alarm.threshold + alarm.steps)}
+        if not all(math.isfinite(alarm.threshold + alarm.steps) for alarm in alarms):
+            raise ValueError("a threshold that is no number")
     except (OSError, ValueError, TypeError) as error:
         raise CheckpointError(path, "alarms from `ugr alarm`", error, fix) from error
-    if other := sorted({str(alarm.checkpoint)[:12] for alarm in found.values() if alarm.checkpoint != sha256}):
+    if other := sorted({str(alarm.checkpoint)[:12] for alarm in alarms if alarm.checkpoint != sha256}):
         raise CheckpointError(path, f"alarms of checkpoint {sha256[:12]}", ", ".join(other), fix)
-    return found
+    return {alarm.execution: alarm for alarm in alarms}
 
 
 def alarm_report(alarm: Alarm, results: Sequence[EpisodeResult]) -> str:
