@@ -27,6 +27,9 @@ class Predictions(NamedTuple):
         refined: (n, K) bool; None where the policy does not refine.
         episode: (n,) position of the episode in the data.
         step: (n,) time step of the observation.
+        missed: (n, 2) metres between where the next keyframe of each arm was seen and where it was shown; None where
+            the policy does not look for them.
+        keyframe: (n, 2) time step of that keyframe; None likewise.
     """
 
     coarse: np.ndarray
@@ -35,6 +38,8 @@ class Predictions(NamedTuple):
     refined: np.ndarray | None
     episode: np.ndarray
     step: np.ndarray
+    missed: np.ndarray | None = None
+    keyframe: np.ndarray | None = None
 
 
 def predict(
@@ -67,6 +72,11 @@ def predict(
             length = ((actions.float() - batch.actions) / std).norm(dim=-1)  # (B, K)
             return length.masked_fill(~batch.valid, torch.nan).double().numpy()
 
+        missed = keyframe = None
+        if chunk.points is not None and batch.keyframes is not None:
+            seen = chunk.points[:, :, 0]  # (B, 2, 3), the tools; behind them, their feet on the table
+            missed = (seen - batch.keyframes.position).norm(dim=-1).double().numpy()  # (B, 2)
+            keyframe = (batch.step[:, None] + batch.keyframes.delay).numpy()  # (B, 2)
         parts.append(
             Predictions(
                 coarse=error(chunk.actions if chunk.coarse is None else chunk.coarse),
@@ -75,6 +85,8 @@ def predict(
                 refined=None if chunk.refined is None else chunk.refined.numpy(),
                 episode=batch.episode.numpy(),
                 step=batch.step.numpy(),
+                missed=missed,
+                keyframe=keyframe,
             )
         )
     whole: list[Any] = [None if of[0] is None else np.concatenate(of) for of in zip(*parts, strict=True)]

@@ -28,6 +28,7 @@ from ugr_lightning.uncertainty.events import KINDS, find_events
 from ugr_lightning.uncertainty.failure import Alarms, Score, detect_failures, overlap_score, uncertainty_score
 from ugr_lightning.uncertainty.foretold import foretold, foretold_table
 from ugr_lightning.uncertainty.predictions import Predictions, predict
+from ugr_lightning.uncertainty.sight import sight_of_keyframes, sight_table
 
 
 @dataclass
@@ -102,7 +103,9 @@ def write_page(
 def begin_study(
     policy: ChunkPolicy, data: ChunkDataModule, checkpoint: dict[str, str], *, stride: int, resamples: int
 ) -> Study:
-    """Predict on both parts of the split; where the policy has an s_k, compare it with the error and with the prior.
+    """Predict on both parts of the split; compare s_k with the error and with the prior; say how keyframes are seen.
+
+    Each where the policy has them.
 
     Args:
         policy: from the checkpoint.
@@ -129,6 +132,9 @@ def begin_study(
         )
     else:
         _add_calibration(study)
+    if sight := sight_of_keyframes(validation, training):
+        study.content["sight"] = sight
+        study.tables.append(sight_table(sight))
     return study
 
 
