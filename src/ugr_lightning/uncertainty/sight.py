@@ -9,7 +9,7 @@ from ugr_lightning.sim.kinematics import SIDES
 from ugr_lightning.uncertainty.predictions import Predictions
 
 
-class Sight(NamedTuple):
+class SeenKeyframe(NamedTuple):
     """How far from one keyframe of an arm a policy sees it, from at most a chunk before it.
 
     Args:
@@ -26,7 +26,7 @@ class Sight(NamedTuple):
     known: tuple[float, float]
 
 
-def sight_of_keyframes(validation: Predictions, training: Predictions) -> list[Sight]:
+def sight_of_keyframes(validation: Predictions, training: Predictions) -> list[SeenKeyframe]:
     """How well each keyframe of a task is seen; empty for a policy that does not look for them.
 
     Args:
@@ -40,7 +40,9 @@ def sight_of_keyframes(validation: Predictions, training: Predictions) -> list[S
         for number in range(1 + max(of_new.max(), of_known.max())):
             here, there = of_new == number, of_known == number  # (n,), (m,)
             when = np.concatenate([validation.keyframe[here, arm], training.keyframe[there, arm]])
-            found.append(Sight(side, number + 1, int(np.median(when)), _spread(new[here]), _spread(known[there])))
+            found.append(
+                SeenKeyframe(side, number + 1, int(np.median(when)), _spread(new[here]), _spread(known[there]))
+            )
     return found
 
 
@@ -61,7 +63,7 @@ def _spread(distances: np.ndarray) -> tuple[float, float]:
     return (float(np.median(seen)), float(np.quantile(seen, 0.9))) if len(seen) else (np.nan, np.nan)
 
 
-def sight_table(found: list[Sight]) -> Cells:
+def sight_table(found: list[SeenKeyframe]) -> Cells:
     """`sight_of_keyframes` as cells, heading first."""
     head = ("arm", "keyframe", "at step", "off on new scenes, median / ninth decile", "on training scenes")
     return [head, *((s.arm, str(s.keyframe), str(s.step), _words(s.new), _words(s.known)) for s in found)]
