@@ -28,7 +28,7 @@ class Episode:
         label: its name where the file holds several episodes.
         projection: (T, V, 3, 4) float32, see `embodiment.image_projection`; None without calibrated cameras.
         endpose: (T + 1, 2, 7) tool poses of the left and right arm before each step and at the end, x y z qw qx qy qz
-            in the world; None where a format does not have them.
+            in the world, without noise on the commands where a file tells them so; None where a format has none.
     """
 
     path: Path

@@ -10,11 +10,13 @@ import numpy as np
 
 from ugr_lightning.data.formats.robotwin import write_episode
 from ugr_lightning.data.storage.jpeg import encode_frame
+from ugr_lightning.demos.intended import intended_poses
 from ugr_lightning.demos.noise import ExecutionNoise, Noise
 from ugr_lightning.errors import DataError, SimulationError
 from ugr_lightning.rollout.film import write_video
 from ugr_lightning.sim.expert import ExpertStep
 from ugr_lightning.sim.frame import Frame
+from ugr_lightning.sim.registry import robot_of
 from ugr_lightning.sim.simulator import Simulator
 from ugr_lightning.system.files import publish_text
 
@@ -122,6 +124,11 @@ class Recorder:
         frames, intentions, simulator = recording.frames, recording.intentions, self._simulator
         scene = {**recording.scene_info, "seed": seed, "attempt": attempt, "steps": len(intentions)}
         text = json.dumps(scene, indent=2)
+        endpose, measured = (np.stack([getattr(frame, name) for frame in frames]) for name in ("endpose", "measured"))
+        expert_action = np.stack([intention.action for intention in intentions])  # (N, A)
+        slack = np.array([intention.slack for intention in intentions], np.float32)  # (N,)
+        forward = None if self._noise.silent else robot_of(simulator.task).forward
+        intended = None if forward is None else intended_poses(endpose, measured, expert_action, slack, forward)
         try:
             if self._video:
                 self._staging.mkdir(parents=True, exist_ok=True)
@@ -131,12 +138,13 @@ class Recorder:
                 staged_episode(self._staging, seed),
                 images=recording.pictures,
                 commanded=np.stack([frame.commanded for frame in frames]),
-                measured=np.stack([frame.measured for frame in frames]),
-                endpose=np.stack([frame.endpose for frame in frames]),
+                measured=measured,
+                endpose=endpose,
+                intended_endpose=intended,
                 contacts=np.stack([frame.contacts for frame in frames]),
-                expert_action=np.stack([intention.action for intention in intentions]),
+                expert_action=expert_action,
                 phase=[intention.phase for intention in intentions],
-                slack=np.array([intention.slack for intention in intentions], np.float32),
+                slack=slack,
                 camera_parameters=recording.camera_parameters,
                 task=simulator.task,
                 setting=simulator.setting,

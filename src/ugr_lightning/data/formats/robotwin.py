@@ -1,6 +1,7 @@
 """RoboTwin 2.0's raw demonstrations: one HDF5 file per episode, written and read.
 
-Ours carry one more group, `ugr/`: the expert's intended command, measured joints, contacts, phases and slack.
+Ours carry one more group, `ugr/`: the expert's intended command and tool poses, measured joints, contacts, phases and
+slack.
 RoboTwin's own tools do not look at it; files of RoboTwin do not have it.
 """
 
@@ -77,6 +78,7 @@ def write_episode(
     noise: Mapping[str, Any] | None = None,
     task_version: int | None = None,
     cameras: Sequence[str] = CAMERAS,
+    intended_endpose: np.ndarray | None = None,
 ) -> None:
     """Write one episode of N decision steps, hence N + 1 frames, so that it is either complete on disk or absent.
 
@@ -103,6 +105,7 @@ def write_episode(
         noise: how noise was injected, plain values; None for none.
         task_version: version of the task; None where it has none.
         cameras: names of the cameras.
+        intended_endpose: (N + 1, 2, 7) `endpose` without the noise, see `demos.intended`; None where nobody knows.
 
     Raises:
         DataError: an array of another shape, or NaN or infinity in one; nothing is written.
@@ -121,6 +124,8 @@ def write_episode(
         "contacts": checked_array(path, "contacts", contacts, (steps + 1, 2)).astype(bool),
         "slack": checked_array(path, "slack", slack, (steps,)).astype(np.float32),
     }
+    if intended_endpose is not None:
+        ours["intended_endpose"] = checked_array(path, "intended_endpose", intended_endpose, (steps + 1, 2, 7))
     if len(phase) != steps:
         raise DataError(f"{path}:phase", f"{steps} names", len(phase), "Give one phase per step.")
     jpegs = encoded_frames(path, images, steps + 1, cameras)
@@ -229,7 +234,9 @@ def _projection(
 
 
 def _endpose(file: h5py.File, frames: int) -> np.ndarray | None:
-    """(T + 1, 2, 7) tool poses; None where the file has none."""
+    """(T + 1, 2, 7) tool poses, without noise where the file knows them so; None where it has none."""
+    if has_key(file, "ugr/intended_endpose"):
+        return read_array(file, "ugr/intended_endpose", (frames, 2, 7))
     names = [f"endpose/{side}_endpose" for side in ("left", "right")]
     if not all(has_key(file, name) for name in names):
         return None
