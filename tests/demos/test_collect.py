@@ -284,3 +284,19 @@ def test_a_robot_of_one_arm_is_recorded_with_its_seven_joints_and_an_undisturbed
         assert file["joint_action/left_arm"].shape == (STEPS + 1, 6)
         assert "right_arm" not in file["joint_action"]
         assert list(file["observation"]) == ["top"]
+
+
+@pytest.mark.parametrize(("noise", "known"), [(0.02, True), (0.0, True), (0.02, False)])
+def test_a_recording_with_noise_tells_where_the_tools_of_a_robot_we_know_were_meant_to_be(
+    tmp_path, monkeypatch, noise, known
+):
+    monkeypatch.setattr(FakeSimulator, "viperx", known)
+    recorder = Recorder(partial(open_simulator, "reach", image_size=(24, 32)), Noise(std=noise), tmp_path)
+    assert recorder.record(0).failure is None
+    with h5py.File(staged_episode(tmp_path, 0)) as file:
+        slack, were = file["ugr/slack"][()], file["endpose/left_endpose"][()]
+        told = bool(noise and known)
+        assert ("intended_endpose" in file["ugr"]) == told
+        if told:
+            moved = np.abs(file["ugr/intended_endpose"][:, 0, :3] - were[:, :3]).max(1)
+            assert (moved[1:] > 0).tolist() == (slack > 0).tolist()

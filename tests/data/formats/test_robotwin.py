@@ -67,6 +67,15 @@ def test_jpegs_marked_as_true_rgb_are_not_swapped(tmp_path, arrays):
     assert read_episode(episode_path(tmp_path, 0)).images(0)[0, 12, 16].tolist()[0] > 190
 
 
+def test_tool_poses_are_those_without_noise_where_a_file_tells_them(tmp_path, arrays):
+    given = arrays()
+    write_episode(tmp_path / "plain.hdf5", **given)
+    np.testing.assert_allclose(read_episode(tmp_path / "plain.hdf5").endpose, given["endpose"], rtol=1e-6)
+    meant = given["endpose"] + 0.01
+    write_episode(tmp_path / "noisy.hdf5", **given, intended_endpose=meant)
+    np.testing.assert_allclose(read_episode(tmp_path / "noisy.hdf5").endpose, meant, rtol=1e-6)
+
+
 def test_the_layout_on_disk_is_robotwins(episode_file, arrays):
     given = arrays()
     with h5py.File(episode_file) as file:
@@ -149,6 +158,7 @@ WRONG = [
     ("commanded", np.zeros((12, 14))),
     ("measured", np.zeros((12, 14))),
     ("endpose", np.full((13, 2, 7), np.nan)),
+    ("intended_endpose", np.zeros((12, 2, 7))),
     ("contacts", np.zeros((13,), bool)),
     ("expert_action", np.full((12, 14), np.inf)),
     ("phase", ["reach"]),
