@@ -128,7 +128,7 @@ def world(monkeypatch):
                 spec.seeds_hash,
                 actor.name,
                 actor.checkpoint,
-                str(spec.execution),
+                actor.called(spec.execution),
                 calls.succeeds(seed, actor, spec.execution),
                 10,
                 refine_ratio=actor.refine_ratio,

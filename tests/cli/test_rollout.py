@@ -183,3 +183,36 @@ def test_shards_share_a_file_and_one_that_is_started_again_doubles_nothing(
     assert "/7 = " in capsys.readouterr().out
     found = sorted(read_results(tmp_path / "parts.jsonl"), key=lambda result: result.seed)
     assert found == read_results(whole)
+
+
+def test_shards_of_who_has_no_chunks_double_nothing_either(world, tmp_path):
+    out = tmp_path / "zero.jsonl"
+    words = ["rollout", "--policy", "zero", "--task", "click_alarmclock", "--episodes", "4", "--out", str(out)]
+    for shard in ("2/2", "1/2", "2/2", "1/1"):
+        assert main([*words, "--shard", shard]) == 0
+    assert [len(call["seeds"]) for call in world] == [2, 2]
+
+
+def test_one_shard_films_the_first_episode_and_no_other_writes_over_it(world, tmp_path, capsys):
+    video, out = tmp_path / "v.gif", tmp_path / "r.jsonl"
+    words = ["rollout", "--policy", "zero", "--task", "click_alarmclock", "--episodes", "4", "--out", str(out)]
+    for shard in ("1/2", "2/2", "1/1"):
+        assert main([*words, "--video", str(video), "--shard", shard]) == 0
+    assert [set(call["videos"]) & set(call["seeds"]) for call in world] == [{world[0]["seeds"][0]}, set()]
+    assert capsys.readouterr().out.count(f"video: {video}") == 2, "the shard that has it, and the whole"
+    assert main([*words, "--shard", "1/1", "--video", str(tmp_path / "late.gif")]) == 0
+    assert f"video: {video}" in capsys.readouterr().out, "where the film of this episode is"
+
+
+@pytest.mark.parametrize("command", ["rollout", "test"])
+def test_a_shard_too_many_has_nothing_to_do(world, tiny_act, untrained, tmp_path, capsys, command):
+    checkpoint = untrained(tiny_act(), tmp_path)
+    assert main([command, str(checkpoint), "--episodes", "4", "--out", str(tmp_path / "r"), "--shard", "5/8"]) == 0
+    assert "nothing to do for shard 5/8 of 4 episodes" in capsys.readouterr().out
+    assert world == []
+
+
+def test_shards_of_a_rollout_need_a_file_that_they_share(world, capsys):
+    assert main(["rollout", "--policy", "zero", "--task", "click_alarmclock", "--shard", "1/2"]) == 2
+    assert "--out FILE" in capsys.readouterr().err
+    assert world == []

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 from ugr_lightning.cli.parsing.call import call
-from ugr_lightning.cli.parsing.shard import every_nth
+from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.training.runs import resolve_checkpoint
 
@@ -74,6 +74,9 @@ def _rollout(
         raise ConfigError("--refine_ratio", "a checkpoint to refine less or more", "none", fix)
     if checkpoint is not None and policy is not None:
         raise ConfigError("--policy", "a checkpoint or one of these, not both", policy, "Leave one out.")
+    if shard is not None and out is None:
+        fix = "Give all of them the same `--out FILE`."
+        raise ConfigError("--shard", "a results file that the shards share", "none", fix)
     part = every_nth(shard)
     loaded = None if checkpoint is None else load_policy(resolve_checkpoint(checkpoint, run, root))
     spec = evaluation_spec(
@@ -89,15 +92,17 @@ def _rollout(
         traces=Path(traces) if traces else None,
         resume=shard is not None,
     )
-    spec = replace(spec, seeds=spec.seeds[part])
     if video:
         spec = replace(spec, videos={spec.seeds[0]: Path(video)})
+    mine = part_of(spec, part)
+    if mine is None:
+        return 0
     actor = (
         checkpoint_actor(*loaded, spec.task, refine_ratio=refine_ratio, device=device) if loaded else policy or "expert"
     )
-    results = run_episodes(actor, spec)
-    if results[0].video:
-        print(f"video: {results[0].video}")
+    results = run_episodes(actor, mine)
+    if video and results[0].seed in spec.videos:
+        print(f"video: {results[0].video or 'none: its episode was in the results file already, or has crashed'}")
     return _tell(results, actor)
 
 
@@ -154,12 +159,14 @@ def _test(
         traces=Path(traces) if traces else None,
         resume=resume or shard is not None,
     )
-    spec = replace(spec, seeds=spec.seeds[part])
+    mine = part_of(spec, part)
+    if mine is None:
+        return 0
     actor = checkpoint_actor(policy, info, spec.task, refine_ratio=refine_ratio, device=device)
     results = []
     with Simulators() as simulators:
         for execution in executions or both_executions(policy):
-            results += run_episodes(actor, replace(spec, execution=execution), simulators=simulators)
+            results += run_episodes(actor, replace(mine, execution=execution), simulators=simulators)
     return _tell(results, actor)
 
 

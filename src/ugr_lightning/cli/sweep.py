@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ugr_lightning.cli.parsing.call import Count, call
-from ugr_lightning.cli.parsing.shard import every_nth
+from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.cli.rollout import ExecutionName, both_executions
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.results.results import EpisodeResult
@@ -153,13 +153,15 @@ def _closed_loop(
     from ugr_lightning.uncertainty.closed_loop import budget_name, execution_name
 
     spec = evaluation_spec(plan.info.data, None, seeds, episodes, workers=workers, out=file, resume=True)
-    spec = replace(spec, seeds=spec.seeds[part])
+    mine = part_of(spec, part)
+    if mine is None:
+        return {}, {}
     with Simulators() as simulators:
 
         def act(ratio: float | None, execution: ExecutionName) -> list[EpisodeResult]:
             changed = None if ratio == plan.trained else ratio
-            actor = checkpoint_actor(plan.policy, plan.info, spec.task, refine_ratio=changed, device=device)
-            return run_episodes(actor, replace(spec, execution=execution), simulators=simulators)
+            actor = checkpoint_actor(plan.policy, plan.info, mine.task, refine_ratio=changed, device=device)
+            return run_episodes(actor, replace(mine, execution=execution), simulators=simulators)
 
         modes: Episodes = {execution_name(execution): act(None, execution) for execution in plan.executions}
         budgets: Episodes = {budget_name(ratio, plan.trained): act(ratio, plan.executions[0]) for ratio in plan.ratios}

@@ -101,6 +101,10 @@ class Actor(ABC):
     def end(self) -> None:  # noqa: B027 - most have nothing to tidy up
         """Tidy up after a run."""
 
+    def called(self, execution: str | int) -> str:
+        """What results call an execution of this actor, also before it has begun."""
+        return self.execution
+
     @abstractmethod
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
         """An episode begins in a slot; `frame` is its first one."""
@@ -229,6 +233,9 @@ class PolicyActor(Actor):
         self._device = tensors[0].device if tensors else torch.device("cpu")
         self._was_training = policy.training
         policy.eval()
+
+    def called(self, execution: str | int) -> str:
+        return make_execution(execution, self.policy.chunk_length, self.policy.action_dim).name
 
     def end(self) -> None:
         self.policy.train(self._was_training)

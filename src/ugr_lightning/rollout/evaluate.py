@@ -239,7 +239,7 @@ def _finished(spec: RolloutSpec, actor: Actor) -> dict[int, EpisodeResult]:
     assert spec.out is not None
     drop_cut_off_line(spec.out)
     stamp = (spec.task, spec.setting, spec.seeds_hash or seeds_hash(spec.seeds))
-    stamp += (actor.name, actor.checkpoint, str(spec.execution))  # type: ignore[assignment]
+    stamp += (actor.name, actor.checkpoint, actor.called(spec.execution))  # type: ignore[assignment]
     return {
         item.seed: item
         for item in (read_results(spec.out) if spec.out.is_file() else [])
