@@ -52,7 +52,7 @@ def test_setting_it_for_one_execution_keeps_that_of_another_and_replaces_that_of
     assert {name: entry["threshold"] for name, entry in kept.items()} == {"25": 9.0, "aggregate": 2.2}
     place.write_text(place.read_text().replace(sha256(checkpoint), "stale"))
     assert main(["rollout", str(checkpoint), "--episodes", "1"]) == 2
-    assert "set the alarm anew" in " ".join(capsys.readouterr().err.split())
+    assert f"(`rm {place}`): then it can be rolled out" in " ".join(capsys.readouterr().err.split())
     assert main(["inspect", str(checkpoint)]) == 0
     assert "got stale" in " ".join(capsys.readouterr().out.split())
     assert main(["alarm", str(checkpoint), str(one)]) == 0

@@ -92,6 +92,16 @@ def test_converting_writes_says_what_was_lost_and_goes_on(folder, capsys):
         (["data", "convert", "{folder}", "out", "--to", "act", "--rate", "0"], "--rate: expected a number above 0"),
         (["data", "convert", "{folder}", "out", "--to", "act", "--cameras", '["top"]'], "top"),
         (["data", "convert", "{folder}", "{folder}", "--to", "act"], "another folder than the source"),
+        (["data", "convert", "{folder}", "out", "act"], "Write `--NAME act`"),
+        (
+            ["data", "inspect", "{folder}", "--layout.state", "0"],
+            "data.layout.state: expected at least one joint, got 0.",
+        ),
+        (
+            ["data", "inspect", "{folder}", "--chunk_length", "0"],
+            "chunk_length: expected a whole number above 0, got 0.",
+        ),
+        (["data", "inspect", "{folder}", "--picture", "{folder}/seed.txt/a.png"], "a part of it is a file"),
     ],
 )
 def test_what_cannot_work_is_one_message_and_exit_code_2(arguments, message, folder, capsys):

@@ -2,6 +2,7 @@ import pytest
 from torch import OutOfMemoryError
 
 from ugr_lightning.cli.failures import explain_training
+from ugr_lightning.errors import ConfigError
 
 FAILURES = {
     "a loader process that was killed": (
@@ -21,6 +22,14 @@ FAILURES = {
 def test_what_ran_out_in_a_training_is_named_with_the_key_that_helps(kind):
     error, says = FAILURES[kind]
     assert says in str(explain_training(error))
+
+
+def test_what_a_class_of_ours_refuses_is_told_also_where_only_its_type_was_named():
+    refused = ConfigError("data.layout.state", "at least one joint", 0, "Correct the number.")
+    outer = ValueError("Does not validate against any of the Union subtypes")
+    outer.__cause__ = ValueError("Problem with given class_path")
+    outer.__cause__.__cause__ = refused
+    assert explain_training(outer) is refused
 
 
 def test_a_fault_of_our_own_stays_one():

@@ -36,7 +36,7 @@ def test_a_problem_of_the_user_is_one_paragraph_and_a_traceback_only_on_request(
         main(["fit"])
 
 
-@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES])
+@pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS, errno.EACCES, errno.ENOTDIR, errno.EEXIST, errno.EISDIR])
 def test_a_disk_that_is_full_or_cannot_be_written_is_a_sentence_whatever_was_being_done(monkeypatch, capsys, number):
     def fail(command, arguments):
         raise OSError(number, os.strerror(number), "runs/a/run.lock")
@@ -48,6 +48,13 @@ def test_a_disk_that_is_full_or_cannot_be_written_is_a_sentence_whatever_was_bei
     number = errno.ENOENT  # nothing that a user's disk is to blame for
     with pytest.raises(FileNotFoundError):
         main(["fit"])
+
+
+def test_a_link_that_leads_to_itself_is_a_sentence(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    assert main(["data", "inspect", "loop"]) == 2
+    assert "Choose another path: a link in it leads to itself." in capsys.readouterr().err
 
 
 def test_training_works_where_no_simulator_is_installed():

@@ -79,6 +79,12 @@ def test_impossible_joints_are_refused(wrong):
         Joint(**wrong)
 
 
+@pytest.mark.parametrize("joint", [Joint(0, scale=np.inf), Joint(0, scale=1e38), Joint("waist", offset=np.nan)])
+def test_units_in_which_a_joint_is_no_number_are_refused(joint):
+    with pytest.raises(ConfigError, match=r"joint .*: expected finite numbers, got others in file\. Correct"):
+        Layout(state=(1, joint)).take(ROWS, "state", NAMES, "file")
+
+
 @pytest.mark.parametrize("nothing", [0, ()])
 def test_a_vector_has_at_least_one_joint(nothing):
     with pytest.raises(ConfigError, match=r"data\.layout\.state"):

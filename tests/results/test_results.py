@@ -106,10 +106,14 @@ def test_a_broken_line_is_named(tmp_path, line):
 @pytest.mark.parametrize(
     ("key", "value", "wanted"),
     [
-        ("success", "yes", "bool"),
-        ("seed", 1.5, "int"),
-        ("first_success_step", "7", "int | None"),
-        ("seconds", 3, "dict"),
+        ("success", "yes", "true or false"),
+        ("success", 1, "true or false"),
+        ("seed", 1.5, "a whole number"),
+        ("steps", True, "a whole number"),
+        ("steps", 10**30, "a whole number"),
+        ("first_success_step", "7", "a whole number or null"),
+        ("seconds", 3, "an object with values that are a number"),
+        ("seconds", {"query": "long"}, "an object with values that are a number"),
     ],
 )
 def test_a_value_of_another_kind_is_named_and_not_counted(tmp_path, key, value, wanted):

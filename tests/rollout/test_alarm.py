@@ -157,10 +157,14 @@ def test_alarms_are_kept_beside_their_checkpoint_and_refused_beside_another(tmp_
     assert file.read_bytes() == b"weights"
 
 
-NO_NUMBER = json.dumps([asdict(alarm("2", threshold=math.nan))])
+EDITED = [("threshold", math.nan), ("execution", 2), ("execution", ["2"]), ("rate", "0.1"), ("steps", 10**400)]
 
 
-@pytest.mark.parametrize("content", ["", '[{"rate": 1}]', "[1]", "7", NO_NUMBER])
+@pytest.mark.parametrize(
+    "content",
+    ["", "{}", '[{"rate": 1}]', "[1]", "7", "[" * 100_000]
+    + [json.dumps([asdict(alarm("2")) | {key: value}]) for key, value in EDITED],
+)
 def test_a_damaged_file_of_alarms_is_named(tmp_path, content):
     (tmp_path / "a.alarm.json").write_text(content)
     with pytest.raises(CheckpointError, match=r"a\.alarm\.json"):

@@ -1,3 +1,5 @@
+from contextlib import suppress
+
 import numpy as np
 import pytest
 from fake_policy import Reacher
@@ -55,5 +57,43 @@ def test_a_damaged_trace_is_named(written):
     with pytest.raises(DataError, match=path.name):
         read_traces([path])
     np.savez(path, seed=1)
+    with pytest.raises(DataError, match=path.name):
+        read_traces([path])
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+    with pytest.raises(DataError, match=path.name):
+        read_traces([path])
+
+
+def test_a_trace_with_a_flipped_byte_is_read_or_named(written):
+    _, folder = written
+    path = sorted(folder.glob("*.npz"))[0]
+    whole = path.read_bytes()
+    for place in range(0, len(whole), 7):
+        path.write_bytes(whole[:place] + bytes([whole[place] ^ 0x5A]) + whole[place + 1 :])
+        with suppress(DataError):  # and nothing else
+            read_traces([path])
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seed": np.zeros(3, int)},
+        {"steps": np.float64("nan")},
+        {"query": np.array(["a"])},
+        {"query": np.zeros(0, int)},
+        {"chunks": np.zeros((2, 5), np.float16)},
+        {"contacts": np.zeros((0, 2), bool)},
+        {"log_variance": np.zeros((1, 5), np.float32)},
+    ],
+)
+def test_arrays_that_are_no_trace_together_are_refused(written, change):
+    _, folder = written
+    path = sorted(folder.glob("*.npz"))[0]
+    with np.load(path) as found:
+        arrays = dict(found)
+    np.savez(path, **arrays)
+    assert len(read_traces([path])) == 1
+    np.savez(path, **arrays | change)
     with pytest.raises(DataError, match=path.name):
         read_traces([path])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ugr_lightning.cli.parsing.call import call_one_of
+from ugr_lightning.cli.parsing.call import Count, call_one_of
 from ugr_lightning.data.layout import Layout
 from ugr_lightning.embodiment import CHUNK_LENGTH
 from ugr_lightning.errors import ConfigError, DataError
@@ -26,7 +26,7 @@ def inspect_data(
     tasks: str | list[str] | None = None,
     episodes: int | list[int] | None = None,
     all: bool = False,
-    chunk_length: int = CHUNK_LENGTH,
+    chunk_length: Count = CHUNK_LENGTH,
     picture: str | None = None,
 ) -> int:
     """Say what demonstrations are: format, lengths, cameras, rates, what the actions are, statistics, oddities.

@@ -14,19 +14,28 @@ _DISK = {
     errno.EACCES: "Correct the permissions, or choose another folder.",
     errno.EPERM: "Correct the permissions, or choose another folder.",
     errno.EMFILE: "Raise the limit of open files: `ulimit -n 4096`.",
+    errno.ENOTDIR: "Choose another path: a part of it is a file.",
+    errno.EEXIST: "Choose another path: a part of it is a file.",
+    errno.EISDIR: "Name a file, not a folder.",
+    errno.ENOTEMPTY: "Choose another name.",
+    errno.ENAMETOOLONG: "Choose a shorter name.",
+    errno.ELOOP: "Choose another path: a link in it leads to itself.",
     errno.EIO: "Look at the system's log: the disk may be failing.",
 }
 
 
-def explain_disk(error: OSError) -> UGRError | None:
-    """The error for a disk that is full or a place that may not be written, whatever was being done; None for others.
+def explain_disk(error: OSError | RuntimeError) -> UGRError | None:
+    """The error for a disk that is full or a place that is none, whatever was being done; None for others.
 
     Args:
-        error: as the system raised it, and nobody nearer has explained.
+        error: as the system raised it, and nobody nearer has explained; or pathlib, of a link that leads to itself.
     """
+    if isinstance(error, RuntimeError):
+        looping = str(error).startswith("Symlink loop")  # an OSError from Python 3.13 on
+        return ConfigError("the path", "a file or folder", error, _DISK[errno.ELOOP]) if looping else None
     if error.errno not in _DISK:
         return None
-    where, got = error.filename or "the disk", os.strerror(error.errno)
+    where, got = error.filename2 or error.filename or "the disk", os.strerror(error.errno)
     return ConfigError(where, "a file that can be read and written", got, _DISK[error.errno])
 
 
@@ -45,6 +54,9 @@ def explain_training(error: Exception) -> UGRError | None:
     if isinstance(error, (OutOfMemoryError, MemoryError)) or "can't allocate memory" in got:
         fix = "Give a smaller batch or `--data.image_size`; frames need none with `--data.cache memmap`."
         return ConfigError("data.batch_size", "a training that fits into memory", got, fix)
+    ours = next((cause for cause in _causes(error.__cause__) if isinstance(cause, UGRError)), None)
+    if ours is not None:  # a class refused its arguments, and its name in a config or a union was all that was told
+        return ours
     missing = next((cause for cause in _causes(error) if isinstance(cause, ImportError)), None)
     if missing is not None:
         fix = "Install it, or leave out what needs it."

@@ -24,7 +24,7 @@ from ugr_lightning.cli.failures import explain_training
 from ugr_lightning.cli.parsing.call import at_home
 from ugr_lightning.cli.parsing.config import expand_includes, explain, flat, run_name
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.errors import CheckpointError, UGRError
+from ugr_lightning.errors import CheckpointError
 from ugr_lightning.models.checkpoint import read_checkpoint
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.limits import usable_cores
@@ -164,8 +164,7 @@ class UGRCLI(LightningCLI):
         try:
             self.config = parser.parse_args(args)
         except argparse.ArgumentError as error:
-            cause = error.__cause__ or error.__context__
-            raise (cause if isinstance(cause, UGRError) else explain(error, self._parser(args[0]))) from None
+            raise explain(error, self._parser(args[0])) from None
 
     def _parse_ckpt_path(self) -> None:
         """Say once and for all where the run is, and resolve `best` and `last` before Lightning sees them.

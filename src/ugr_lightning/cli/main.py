@@ -71,7 +71,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with stoppable():
             return _run(arguments[0], arguments[1:])
-    except (UGRError, OSError) as error:
+    except (UGRError, OSError, RuntimeError) as error:
         if isinstance(error, BrokenPipeError):  # `ugr ... | head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             return 0

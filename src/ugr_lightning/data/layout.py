@@ -133,6 +133,7 @@ class Layout:
 
         Raises:
             DataError: another number of columns than stated, or a joint that the file does not have.
+            ConfigError: units in which a joint is no finite number.
         """
         wanted, columns = self._wanted(vector), values.shape[1]
         if isinstance(wanted, int):
@@ -149,8 +150,17 @@ class Layout:
         if missing:
             got = f"{columns} columns{': ' if known else ' without names'}{', '.join(known)}"
             raise DataError(where, f"the joints {missing} of `data.layout.{vector}`", got, "Correct the layout.")
-        taken = [j.convert(values[:, j.source if isinstance(j.source, int) else known[j.source]]) for j in joints]
-        return np.stack(taken, axis=1)  # (T, S) or (T, A)
+        places = [joint.source if isinstance(joint.source, int) else known[joint.source] for joint in joints]
+        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+            taken = [joint.convert(values[:, place]) for joint, place in zip(joints, places, strict=True)]
+        rows = np.stack(taken, axis=1)  # (T, S) or (T, A)
+        if not np.isfinite(rows).all():
+            odd = joints[int(np.argwhere(~np.isfinite(rows))[0, 1])]
+            fix = "Correct its `scale`, `offset`, `closed` or `open`."
+            raise ConfigError(
+                f"data.layout.{vector}, joint {odd.source!r}", "finite numbers", f"others in {where}", fix
+            )
+        return rows
 
     def find_cameras(self, cameras: Sequence[str], available: Sequence[str], where: Path) -> tuple[str, ...]:
         """What the cameras asked for are called in a file.

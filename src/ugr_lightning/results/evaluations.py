@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Iterable
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import yaml
@@ -10,6 +10,7 @@ import yaml
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.results import EpisodeResult, read_results
 from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.records import read_record
 
 RUN_FILE, RESULTS_FILE = "run.json", "results.jsonl"
 
@@ -57,11 +58,10 @@ class RunInfo:
         path = folder / RUN_FILE
         fix = "Restore the file, or remove the folder and run `ugr benchmark` again."
         try:
-            content = json.loads(path.read_text())
-            return cls(**content)
-        except (OSError, ValueError, TypeError) as error:
-            keys = ", ".join(item.name for item in fields(cls))
-            raise DataError(path, f"a JSON object with {keys}", str(error), fix) from error
+            content = path.read_bytes()
+        except OSError as error:
+            raise DataError(path, "what a training of a benchmark is", str(error), fix) from error
+        return read_record(cls, content, path, fix)
 
 
 @dataclass(frozen=True)

@@ -7,11 +7,12 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, BinaryIO, NamedTuple
 
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.tables import as_text
 from ugr_lightning.system.lock import flock
+from ugr_lightning.system.records import read_record
 
 Z_95 = 1.959963984540054
 """The 97.5 % quantile of the normal distribution."""
@@ -187,32 +188,6 @@ def read_results(path: str | Path) -> list[EpisodeResult]:
     path = Path(path)
     if not path.is_file():
         raise DataError(path, "a results file", "no such file", "Write one with `ugr rollout`.")
-    kinds = _kinds()
-    known = set(kinds)
-    results = []
-    for number, line in enumerate(path.read_bytes().splitlines(), start=1):
-        if not line.strip():
-            continue
-        where, fix = f"{path}, line {number}", "Delete this line; the other lines are independent of it."
-        try:
-            entry = json.loads(line)
-        except ValueError as error:
-            raise DataError(where, "one JSON object", f"a broken line ({error})", fix) from error
-        if not isinstance(entry, dict) or not set(entry) <= known:
-            unknown = sorted(set(entry) - known) if isinstance(entry, dict) else type(entry).__name__
-            raise DataError(where, f"the keys {sorted(known)}", f"also {unknown}", fix)
-        if odd := [name for name, value in entry.items() if not isinstance(value, kinds[name])]:
-            kind = kinds[odd[0]]
-            raise DataError(f"{where}, {odd[0]}", getattr(kind, "__name__", kind), repr(entry[odd[0]]), fix)
-        try:
-            results.append(EpisodeResult(**entry))
-        except TypeError as error:
-            raise DataError(where, "a complete episode result", str(error), fix) from error
-    return results
-
-
-def _kinds() -> dict[str, Any]:
-    """By key of an episode's line, the types that its value may have; a whole number is a float, too."""
-    hints = get_type_hints(EpisodeResult)
-    plain = {name: get_origin(hint) if get_origin(hint) is dict else hint for name, hint in hints.items()}
-    return {name: kind | int if float in get_args(kind) else kind for name, kind in plain.items()}
+    fix = "Delete this line; the other lines are independent of it."
+    lines = [(n, line) for n, line in enumerate(path.read_bytes().splitlines(), start=1) if line.strip()]
+    return [read_record(EpisodeResult, line, f"{path}, line {number}", fix) for number, line in lines]

@@ -9,6 +9,7 @@ from ugr_lightning.errors import DataError
 from ugr_lightning.results.evaluations import Evaluation, read_benchmark
 from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.records import parse_json
 
 SUMMARY_FILE = "summary.jsonl"
 FIX = "Write the file again with `ugr report ... --out`, from the results it was made of."
@@ -105,8 +106,8 @@ def _episodes(about: dict[str, Any]) -> list[EpisodeResult]:
 
 def _checked(where: str, line: str) -> dict[str, Any]:
     try:
-        about = json.loads(line)
-    except (ValueError, RecursionError) as error:
+        about = parse_json(line)
+    except ValueError as error:
         raise DataError(where, "one JSON object", f"a broken line ({error})", FIX) from error
     if not isinstance(about, dict) or not all(isinstance(about.get(key), str) for key in TEXTS):
         raise DataError(where, f"an object with {', '.join(TEXTS)}", line[:80], FIX)

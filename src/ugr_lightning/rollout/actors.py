@@ -235,7 +235,8 @@ class PolicyActor(Actor):
         policy.eval()
 
     def called(self, execution: str | int) -> str:
-        return make_execution(execution, self.policy.chunk_length, self.policy.action_dim).name
+        text = str(execution).strip()
+        return str(int(text)) if text.isdigit() else text
 
     def end(self) -> None:
         self.policy.train(self._was_training)

@@ -12,6 +12,7 @@ from ugr_lightning.errors import CheckpointError, ConfigError, DataError
 from ugr_lightning.results.results import EpisodeResult, wilson_interval
 from ugr_lightning.rollout.overlap import Overlap, near_disagreement
 from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.records import checked_record, parse_json
 
 
 @dataclass(frozen=True)
@@ -168,18 +169,27 @@ def read_alarms(checkpoint: Path, sha256: str) -> dict[str, Alarm]:
     Raises:
         CheckpointError: a damaged file, or alarms of another checkpoint.
     """
-    path, fix = alarms_path(checkpoint), "Remove the file, or set the alarm anew with `ugr alarm`."
+    path = alarms_path(checkpoint)
+    fix = f"Remove the file (`rm {path}`), or set the alarm anew with `ugr alarm`."
     if not path.is_file():
         return {}
     try:
-        alarms = [Alarm(**entry) for entry in json.loads(path.read_text(encoding="utf-8"))]
-        if not all(math.isfinite(alarm.threshold + alarm.steps) for alarm in alarms):
-            raise ValueError("a threshold that is no number")
-    except (OSError, ValueError, TypeError) as error:
+        alarms = [checked_record(Alarm, entry, path, fix) for entry in _entries(path.read_bytes())]
+    except DataError as error:
+        raise CheckpointError(error.where, f"alarms from `ugr alarm`: {error.expected}", error.got, fix) from error
+    except (OSError, ValueError) as error:
         raise CheckpointError(path, "alarms from `ugr alarm`", error, fix) from error
     if other := sorted({str(alarm.checkpoint)[:12] for alarm in alarms if alarm.checkpoint != sha256}):
-        raise CheckpointError(path, f"alarms of checkpoint {sha256[:12]}", ", ".join(other), fix)
+        anew = f"Remove the file (`rm {path}`): then it can be rolled out, and `ugr alarm` can set its own."
+        raise CheckpointError(path, f"alarms of checkpoint {sha256[:12]}", ", ".join(other), anew)
     return {alarm.execution: alarm for alarm in alarms}
+
+
+def _entries(text: bytes) -> list[object]:
+    found = parse_json(text)
+    if not isinstance(found, list):
+        raise ValueError(type(found).__name__)
+    return found
 
 
 def alarm_report(alarm: Alarm, results: Sequence[EpisodeResult]) -> str:

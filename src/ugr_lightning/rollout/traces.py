@@ -1,6 +1,7 @@
 """What a policy predicted in an episode, step by step, kept beside the results for analysis."""
 
 import zipfile
+import zlib
 from collections.abc import Iterable
 from pathlib import Path
 from typing import NamedTuple
@@ -11,6 +12,17 @@ from ugr_lightning.errors import DataError
 from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.rollout.trajectory import EpisodeTrace
 from ugr_lightning.system.files import publish
+
+_DAMAGED = (OSError, ValueError, TypeError, KeyError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error)
+_KINDS = {
+    "seed": "iu",
+    "success": "b",
+    "steps": "iu",
+    "query": "iu",
+    "chunks": "f",
+    "log_variance": "f",
+    "contacts": "b",
+}
 
 
 class PredictionTrace(NamedTuple):
@@ -80,10 +92,21 @@ def read_traces(paths: Iterable[Path]) -> list[PredictionTrace]:
     for path in paths:
         try:
             with np.load(path, allow_pickle=False) as found:
-                values = {name: found[name] for name in PredictionTrace._fields}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+                traces.append(_checked({name: found[name] for name in PredictionTrace._fields}))
+        except _DAMAGED as error:
             fix = "Remove the file, and run the episode again."
             raise DataError(path, "a trace from `ugr rollout --traces`", error, fix) from error
-        scalars = {name: values[name].item() for name in ("seed", "success", "steps")}
-        traces.append(PredictionTrace(**{**values, **scalars}))
     return sorted(traces, key=lambda trace: trace.seed)
+
+
+def _checked(values: dict[str, np.ndarray]) -> PredictionTrace:
+    """The arrays as a trace; a ValueError where they are none together."""
+    if odd := [name for name, kinds in _KINDS.items() if values[name].dtype.kind not in kinds]:
+        raise ValueError(f"{odd[0]} of type {values[odd[0]].dtype}")
+    trace = PredictionTrace(**{**values, **{name: values[name].item() for name in ("seed", "success", "steps")}})
+    queries, chunk = len(np.atleast_1d(trace.query)), trace.chunks.shape[1:2]
+    shapes = [(queries,), (queries, *chunk, *trace.chunks.shape[2:3]), (trace.steps + 1, 2)]
+    found = [trace.query.shape, trace.chunks.shape, trace.contacts.shape]
+    if found != shapes or trace.log_variance.shape not in ((queries, *chunk), (queries, 0)):
+        raise ValueError(f"query, chunks, contacts and log_variance of {[*found, trace.log_variance.shape]}")
+    return trace

@@ -103,6 +103,8 @@ def test_one_of_several_functions_is_called_by_name_and_its_first_arguments_by_p
         (["--size", "[1]"], "size: expected a tuple with 2 elements or null, got [1]."),
         (["--quick", "perhaps"], "quick: expected true or false, got perhaps."),
         (["--options", "3"], "options: expected a mapping, got 3."),
+        (["--names", "high"], "names: expected a list, got high."),
+        (["--numbers", "5.5"], "numbers: expected a whole number or a list, got 5.5."),
     ],
 )
 def test_a_wrong_value_is_told_in_words_and_not_in_types(words, says):
@@ -114,6 +116,8 @@ def test_a_wrong_value_is_told_in_words_and_not_in_types(words, says):
         size: tuple[int, int] | None = None,
         quick: bool = False,
         options: dict[str, int] = {},  # noqa: B006 - jsonargparse copies it
+        names: tuple[str, ...] = (),
+        numbers: int | tuple[int, ...] = 0,
     ) -> int:
         return 0
 

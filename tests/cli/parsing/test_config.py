@@ -125,6 +125,13 @@ def test_missing_and_circular_includes_are_errors(tmp_path):
         expand_includes([f"--config={tmp_path / 'a.yaml'}"])
 
 
+@pytest.mark.parametrize("given", ["5", "[5]", "{a: b}", "[[base]]"])
+def test_what_is_included_is_named_or_refused(tmp_path, given):
+    (tmp_path / "a.yaml").write_text(f"include: {given}\n")
+    with pytest.raises(ConfigError, match="a name or path, or a list of them"):
+        expand_includes([f"--config={tmp_path / 'a.yaml'}"])
+
+
 def test_a_run_is_named_after_its_configs():
     assert (
         run_name(["--config", "configs/uncert.yaml", "--config=configs/task/handover_block.yaml"])

@@ -14,7 +14,7 @@ from jsonargparse import ArgumentParser, Namespace
 from jsonargparse.typing import NonNegativeInt, PositiveInt
 
 from ugr_lightning.cli.parsing.config import explain
-from ugr_lightning.errors import ConfigError, UGRError
+from ugr_lightning.errors import ConfigError
 
 if TYPE_CHECKING:
     Count = int
@@ -55,9 +55,7 @@ def call(function: Callable[..., int], command: str, argv: Sequence[str], leadin
     try:
         words = name_words(argv, leading, {name: one.annotation for name, one in parameters.items()})
         options = parser.instantiate_classes(at_home(parser.parse_args(words)))
-    except argparse.ArgumentError as error:
-        if isinstance(error.__cause__ or error.__context__, UGRError):
-            raise (error.__cause__ or error.__context__) from None  # type: ignore[misc]
+    except (argparse.ArgumentError, ValueError) as error:  # the second of a class in a union
         raise explain(error, parser) from None
     return function(**{name: options[name] for name in parameters})
 

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from jsonargparse import ArgumentParser
 
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.errors import ConfigError, UGRError
 
 
 def expand_includes(argv: Sequence[str]) -> list[str]:
@@ -90,8 +90,11 @@ def _includes(path: Path) -> list[str]:
         return []
     if not isinstance(content, dict):
         raise ConfigError(path, "a mapping of keys to values", type(content).__name__, "Correct the file.")
-    included = content.get("include") or []
-    return [included] if isinstance(included, str) else list(included)
+    given = content.get("include") or []
+    included = [given] if isinstance(given, str) else given
+    if not isinstance(included, list) or not all(isinstance(name, str) for name in included):
+        raise ConfigError(f"`include` in {path}", "a name or path, or a list of them", given, "Correct the file.")
+    return included
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -117,17 +120,26 @@ def run_name(argv: Sequence[str]) -> str:
     return "-".join(names) or "run"
 
 
-def explain(error: Exception, parser: ArgumentParser | None) -> ConfigError:
+def explain(error: Exception, parser: ArgumentParser | None) -> UGRError:
     """Turn a parser's error into one paragraph that names the key and what was probably meant.
 
     Args:
-        error: what the parser raised.
+        error: what the parser raised; where that was because a class refused its arguments in our words, these hold.
         parser: the parser of the subcommand, for the keys it knows.
     """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, UGRError):
+            return cause
+        cause = cause.__cause__ or cause.__context__
     message = " ".join(str(error).split())
     unknown = re.findall(r"[Kk]ey '?\"?([\w.\-]+)'?\"? is not expected", message)
     unknown += re.findall(r"(?:[Nn]o action for key|Nested key|[Oo]ption) '?\"?([\w.\-]+)'?\"?", message)
-    unknown += [word.lstrip("-").split("=")[0] for word in re.findall(r"[Uu]nrecognized arguments: (\S+)", message)]
+    words = re.findall(r"[Uu]nrecognized arguments: (\S+)", message)
+    if words and not words[0].startswith("-"):
+        fix = f"Write `--NAME {words[0]}`; `--help` lists the names."
+        return ConfigError("command line", "the name of an option before its value", f"the word {words[0]}", fix)
+    unknown += [word.lstrip("-").split("=")[0] for word in words]
     if not unknown:
         keys = re.findall(r"[Kk]ey \"([\w.\-]+)\": ", message)
         told = message.rpartition(f'"{keys[-1]}": ')[2] if keys else message
@@ -151,6 +163,8 @@ _IN_WORDS = {
     "str": "text",
     "dict": "a mapping",
     "list": "a list",
+    "tuple": "a list",
+    "set": "a list",
     "NoneType": "null",
 }
 _KIND = r"(?:Expected an?|Not of type) (?:typing\.Literal\[(.*?)\]|<class '(\w+)'>|(\w+Int)\b|(tuple .*? elements))"
@@ -161,7 +175,8 @@ def _wanted(told: str) -> tuple[str, str]:
     """What the types of a key accept, and the value that none of them does, in words where jsonargparse names both."""
     choices: dict[str, None] = {}  # in order, each once
     for words, kind, number, several in re.findall(_KIND, told):
-        choices |= dict.fromkeys(re.findall("'(.*?)'", words) or [_IN_WORDS.get(kind + number) or f"a {several}"])
+        wanted = _IN_WORDS.get(kind + number) or f"a {several or kind or number}"
+        choices |= dict.fromkeys(re.findall("'(.*?)'", words) or [wanted])
     values = re.findall(_VALUE, told)
     if not choices or not values:
         return "a value that the key accepts", told[:600].rstrip(".")

@@ -1,6 +1,5 @@
 """Control: refine the positions that are worst on average, whatever the input."""
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.refine.ranked import Ranked
+from ugr_lightning.system.records import parse_json
 
 FIX = "`ugr analyze` on a trained policy writes `prior.json`: its mean error by position on the training episodes."
 
@@ -46,7 +46,7 @@ class Prior(Ranked):
 
 def _read(path: Path) -> list[float]:
     try:
-        found = json.loads(path.read_text())
+        found = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise ConfigError(f"Prior.file {path}", "a JSON list of numbers", error, FIX) from error
     if not isinstance(found, list) or not all(type(item) in (int, float) for item in found):
