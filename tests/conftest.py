@@ -10,7 +10,11 @@ import torch
 
 from ugr_lightning.sim.render import RenderProbe, probe_rendering
 
-torch.set_num_threads(1)
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """Each test starts with one thread, also after a command that took all cores."""
+    torch.set_num_threads(1)
 
 
 def _probe() -> RenderProbe:

@@ -39,6 +39,13 @@ def fake_environment(size=SIZE):
     return TaskEnv(FakeSimulator("reach", image_size=size))
 
 
+def begun():
+    """An environment at the beginning of an episode, and what it shows."""
+    environment = fake_environment()
+    environment.setup_demo(0)
+    return environment, environment.get_obs()
+
+
 @pytest.mark.parametrize(
     "policy", [Reacher(), Recaller(), tiny_act(), looking_act()], ids=["reacher", "recaller", "act", "keyframes"]
 )
@@ -51,9 +58,7 @@ def test_every_execution_moves_as_in_our_own_rollout(rolled_out, policy, tmp_pat
 
 def test_a_policy_with_keyframes_refuses_an_environment_without_calibration(tmp_path):
     model = robotwin.get_model(settings(save(looking_act(), tmp_path / "a.ckpt")))
-    environment = fake_environment()
-    environment.setup_demo(0)
-    observation = environment.get_obs()
+    environment, observation = begun()
     for view in observation["observation"].values():
         view.pop("extrinsic_cv", None)
     with pytest.raises(ProtocolError, match=r"^head_camera/extrinsic_cv: .*\(3, 4\).* got nothing"):
@@ -98,9 +103,7 @@ def test_pictures_of_robotwins_size_are_shrunk_as_in_training(tmp_path):
 
 
 def test_cameras_are_found_by_name_in_whatever_order_the_policy_wants_them(tmp_path):
-    observation = fake_environment()
-    observation.setup_demo(0)
-    encoded = robotwin.encode_obs(observation.get_obs())
+    encoded = robotwin.encode_obs(begun()[1])
     cameras = ("cam_left_wrist", "cam_high")
     model = robotwin.get_model(settings(save(Reacher(cameras=cameras), tmp_path / "a.ckpt")))
     seen = model.deployment.see(encoded["images"], encoded["state"])
@@ -148,9 +151,7 @@ def test_checkpoints_that_cannot_be_evaluated_are_refused(tmp_path):
 
 
 def test_observations_of_another_form_are_refused_by_name(reacher):
-    environment = fake_environment()
-    environment.setup_demo(0)
-    model = robotwin.get_model(settings(reacher))
+    (environment, _), model = begun(), robotwin.get_model(settings(reacher))
     for spoil, complaint in (
         (lambda o: o["observation"].pop("left_camera"), "left_camera"),
         (lambda o: o["observation"]["head_camera"].update(rgb=np.zeros((4, 4))), "head_camera"),
@@ -166,13 +167,10 @@ def test_observations_of_another_form_are_refused_by_name(reacher):
 
 
 def test_a_command_that_is_not_finite_never_reaches_the_robot(tmp_path):
-    model, environment = (
-        robotwin.get_model(settings(save(Reacher(broken=0.1), tmp_path / "a.ckpt"))),
-        fake_environment(),
-    )
-    environment.setup_demo(0)
+    model = robotwin.get_model(settings(save(Reacher(broken=0.1), tmp_path / "a.ckpt")))
+    environment, observation = begun()
     with pytest.raises(NumericsError, match="at \\[0\\]"):
-        robotwin.eval(environment, model, environment.get_obs())
+        robotwin.eval(environment, model, observation)
     assert environment.take_action_cnt == 0
 
 
@@ -208,9 +206,8 @@ def test_an_alarm_is_logged_once_an_episode_and_travels_with_a_copied_checkpoint
     ] * 2
     assert (model.deployment.alarms, silent.deployment.alarms) == ({0: 4}, {})
     model.reset_model()
-    environment = fake_environment()
-    environment.setup_demo(0)
-    robotwin.eval(environment, model, environment.get_obs())
+    environment, observation = begun()
+    robotwin.eval(environment, model, observation)
     assert model.deployment.alarms == {}
     robotwin.write_policy(reacher, folder, execution=2, copy=True)
     assert not (folder / "policy_best.alarm.json").exists(), "one without an alarm takes the place of one with it"

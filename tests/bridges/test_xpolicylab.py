@@ -9,15 +9,16 @@ import sys
 import tracemalloc
 import types
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
 import pytest
-import simplejpeg
 import torch
 from deployed import Recaller, looking_act, save, tiny_act
 from fake_policy import Reacher
 from fake_simulator import HOME, FakeSimulator
+from foreign_files import marked_jpeg
 
 from ugr_lightning.bridges.deployment import Deployment, Sight, scaled
 from ugr_lightning.bridges.xpolicylab import codec
@@ -126,15 +127,14 @@ def test_xpolicylabs_loop_moves_as_in_our_own_rollout(adapter, rolled_out, tmp_p
     assert batch.outcomes() == expected, "all at once"
     with served(module("model").Model(read_deployment(folder, {}))) as server:
         for kind in (Client, AugustClient):
-            client = kind(server.url)
-            for seed, outcome in zip(seeds, expected, strict=True):
-                single = fakes([seed])
-                deploy.eval_one_episode(single, client)
-                assert single.outcomes() == [outcome], f"one after the other, over a socket, {kind.__name__}"
-            batch = fakes(seeds)
-            deploy.eval_one_episode_batch(batch, client)
-            assert batch.outcomes() == expected, f"all at once, over a socket, {kind.__name__}"
-            client.close()
+            with closing(kind(server.url)) as client:
+                for seed, outcome in zip(seeds, expected, strict=True):
+                    single = fakes([seed])
+                    deploy.eval_one_episode(single, client)
+                    assert single.outcomes() == [outcome], f"one after the other, over a socket, {kind.__name__}"
+                batch = fakes(seeds)
+                deploy.eval_one_episode_batch(batch, client)
+                assert batch.outcomes() == expected, f"all at once, over a socket, {kind.__name__}"
 
 
 def test_a_thousand_requests_of_eight_environments_with_reconnects_each_get_their_own_reply(reacher):
@@ -171,8 +171,7 @@ def memory_mb():
 
 def test_ten_thousand_malformed_frames_are_refused_politely_and_leave_nothing_behind(reacher, tmp_path, caplog):
     rng, count, trap = np.random.default_rng(0), 0, tmp_path / "trap"
-    with serve(reacher) as server:
-        good = Client(server.url)
+    with serve(reacher) as server, closing(Client(server.url)) as good:
         first = [vectors(good.infer(seen(0, step), name=f"good {step}")) for step in [0]]
         with connect(server.url, compression=None) as connection:
             warm = None
@@ -194,7 +193,6 @@ def test_ten_thousand_malformed_frames_are_refused_politely_and_leave_nothing_be
         assert memory_mb() - warm < 20
         good.step = 1
         second = vectors(good.infer(seen(0, 1)))
-        good.close()
     expected = alone(reacher, 0, 2)
     assert np.array_equal(first[0], expected[0])
     assert np.array_equal(second, expected[1]), "another client's episode has not noticed"
@@ -208,15 +206,13 @@ def test_a_frame_beyond_the_limit_ends_its_connection_only(reacher):
             connection.send(b"\0" * (2 * codec.BYTES_OF_ENVIRONMENT + 1))
             with pytest.raises(ConnectionClosed):
                 connection.recv(timeout=60)
-        client = Client(server.url)
-        assert client.ask("heartbeat")["message_type"] == "heartbeat_ack"
-        client.close()
+        with closing(Client(server.url)) as client:
+            assert client.ask("heartbeat")["message_type"] == "heartbeat_ack"
 
 
 def test_ten_environments_at_full_size_travel_in_one_message_and_memory_stays_flat(reacher):
     full = (480, 640)
-    with serve(reacher) as server:
-        client = AugustClient(server.url)
+    with serve(reacher) as server, closing(AugustClient(server.url)) as client:
         held = []  # bytes; the process's pages would tell how the allocator keeps what was freed
         tracemalloc.start()
         for step in range(6):
@@ -226,13 +222,12 @@ def test_ten_environments_at_full_size_travel_in_one_message_and_memory_stays_fl
             gc.collect()
             held.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
-        client.close()
     assert held[-1] - held[1] < 1e6, "a message is 28 MB"
 
 
 def test_a_call_that_is_sent_again_is_computed_once(reacher):
-    with serve(reacher) as server:
-        client, expected = AugustClient(server.url), alone(reacher, 0, 3)
+    expected = alone(reacher, 0, 3)
+    with serve(reacher) as server, closing(AugustClient(server.url)) as client:
         for step in range(3):
             client.call("update_obs", seen(0, step), name=f"seen {step}")
             first = client.call("get_action", name=f"act {step}")
@@ -243,7 +238,6 @@ def test_a_call_that_is_sent_again_is_computed_once(reacher):
             assert np.array_equal(vectors(first), expected[step])
         with pytest.raises(RuntimeError, match="give each request its own"):
             client.call("get_action", name="seen 0")
-        client.close()
 
 
 ENCODED = {
@@ -258,23 +252,18 @@ ENCODED = {
 def test_encoded_colours_give_what_decoded_ones_give(form, marked, reacher):
     picture = np.zeros((16, 24, 3), np.uint8)
     picture[..., 0], picture[..., 2] = 200, 40
-    jpeg = encode_jpeg(picture)
-    if marked:
-        jpeg = simplejpeg.encode_jpeg(picture, quality=95, colorspace="RGB", colorsubsampling="420")
-        jpeg = jpeg[:2] + b"\xff\xfe" + (10).to_bytes(2, "big") + b"XPL-RGB1" + jpeg[2:]
+    jpeg = marked_jpeg(encode_jpeg(picture[..., ::-1])) if marked else encode_jpeg(picture)
     sent = observation(picture, HOME)
     for camera in sent["vision"]:
         sent["vision"][camera] = ENCODED[form](jpeg)
     shown, _, _ = read_observation(codec.unpack(encode(sent)))
     assert all(np.abs(one.astype(int) - picture).max() < 8 for one in shown.values())
-    with serve(reacher) as server:
-        client = AugustClient(server.url)
+    with serve(reacher) as server, closing(AugustClient(server.url)) as client:
         client.call("update_obs", sent)
         assert len(client.call("get_action")) == 1
         sent["vision"]["cam_head"] = {"color": jpeg[:-20]}
         with pytest.raises(RuntimeError, match="call_failed"):
             client.call("update_obs", sent)
-        client.close()
 
 
 def calibrated(environment, step, size, extrinsics=slice(3)):
@@ -316,15 +305,16 @@ def test_a_policy_with_keyframes_is_told_the_calibration_and_acts_as_asked_direc
         view["color"], view["image"] = None, jpeg
     shown = {name: {**view, "color": read_observation(plain)[0][name]} for name, view in one["vision"].items()}
     expected_encoded = asked_directly(policy, {**one, "vision": shown}, size)
-    with serve(save(policy, tmp_path / "a.ckpt"), execution="chunk") as server:
-        client = AugustClient(server.url)
+    with (
+        serve(save(policy, tmp_path / "a.ckpt"), execution="chunk") as server,
+        closing(AugustClient(server.url)) as client,
+    ):
         client.call("update_obs_batch", [one, {**other, "env_idx": 1}])
         for actions, chunk in zip(client.call("get_action_batch", [0, 1]), expected, strict=True):
             assert np.array_equal(vectors(actions), chunk)
         client.call("reset")
         client.call("update_obs", plain)
         assert np.array_equal(vectors(client.call("get_action")), expected_encoded), "with encoded colours"
-        client.close()
     for name, view in one["vision"].items():
         view["extrinsics_matrix"] = other["vision"][name]["extrinsics_matrix"]
     assert not np.array_equal(asked_directly(policy, one, size), expected[0]), "it matters"
@@ -362,21 +352,22 @@ def test_a_calibration_that_cannot_be_used_is_named_and_who_does_not_need_it_doe
 
 @pytest.mark.parametrize("name", ["feedback", "__class__", "deployment", "disconnect", "", None, 7])
 def test_a_function_that_nobody_knows_is_a_named_error_and_the_connection_lives(name, reacher):
-    with serve(reacher) as server:
-        client = AugustClient(server.url)
+    with serve(reacher) as server, closing(AugustClient(server.url)) as client:
         reply = client.ask("call", {"func_name": name})
         assert reply["payload"]["code"] == "call_failed"
         assert "update_obs" in reply["payload"]["message"]
         assert client.ask("batch_infer")["payload"]["code"] == "unknown_message_type"
         client.call("update_obs", seen(0, 0))
         assert np.array_equal(vectors(client.call("get_action")), alone(reacher, 0, 1)[0])
-        client.close()
 
 
 def test_parallel_workers_of_one_session_do_not_forget_each_others_episodes(reacher):
     """RoboTwin's workers have one session, a connection and a number of the environment each."""
-    with serve(reacher) as server:
-        one, other = AugustClient(server.url), AugustClient(server.url)
+    with (
+        serve(reacher) as server,
+        closing(AugustClient(server.url)) as one,
+        closing(AugustClient(server.url)) as other,
+    ):
         expected = {index: alone(reacher, index, 3) for index in (0, 1)}
         for step in range(2):
             for index, client in enumerate((one, other)):
@@ -388,7 +379,6 @@ def test_parallel_workers_of_one_session_do_not_forget_each_others_episodes(reac
         assert np.array_equal(vectors(other.call("get_action")), expected[1][2]), "not begun anew"
         one.call("update_obs", seen(0, 0))
         assert np.array_equal(vectors(one.call("get_action")), expected[0][0]), "begun anew"
-        one.close(), other.close()
 
 
 def test_a_web_page_cannot_connect_and_the_server_is_on_this_machine_only(reacher):
@@ -399,8 +389,7 @@ def test_a_web_page_cannot_connect_and_the_server_is_on_this_machine_only(reache
 
 
 def test_every_kind_of_request_gets_the_reply_of_its_name(reacher):
-    with serve(reacher) as server:
-        client = Client(server.url)
+    with serve(reacher) as server, closing(Client(server.url)) as client:
         for kind, answer in (("prepare_case", "prepare_case_ack"), ("reset", "reset_result"), ("hello", "hello_ack")):
             assert client.ask(kind)["message_type"] == answer
         assert client.ask("trial_end", {"success": True})["message_type"] == "trial_end_ack"
@@ -417,8 +406,11 @@ def test_replies_tell_of_an_alarm_from_its_step_to_the_end_of_the_episode(reache
     file = tmp_path / "policy_best.ckpt"
     file.write_bytes(reacher.read_bytes())
     write_alarms(file, [Alarm(sha256(file), "2", "reach", "demo_clean", "hash", 40, 0.1, threshold=9.0, steps=3)])
-    with serve(file, execution=2) as server:
-        client, other = Client(server.url), AugustClient(server.url, trial="another")
+    with (
+        serve(file, execution=2) as server,
+        closing(Client(server.url)) as client,
+        closing(AugustClient(server.url, trial="another")) as other,
+    ):
         told = [client.ask("infer", {"observation": seen(3, step)}, step=step)["payload"] for step in range(4)]
         assert [reply.get("alarms") for reply in told] == [None, None, {"3": 4}, {"3": 4}]
         again = client.ask("call", {"func_name": "get_action", "obs": seen(3, 9)})["payload"]
@@ -426,17 +418,13 @@ def test_replies_tell_of_an_alarm_from_its_step_to_the_end_of_the_episode(reache
         assert len(again["result"]) == 2
         assert "alarms" not in other.ask("call", {"func_name": "infer", "obs": seen(0, 0)})["payload"]
         assert "alarms" not in client.ask("reset")["payload"]
-        client.close()
-        other.close()
     assert caplog.text.count("alarm in environment") == 1
 
 
 def test_a_failure_inside_the_policy_is_told_without_its_traceback(reacher, monkeypatch, caplog):
-    with serve(reacher) as server:
+    with serve(reacher) as server, closing(Client(server.url)) as client:
         monkeypatch.setattr(server.model.deployment, "act", lambda seen: 1 / 0)
-        client = Client(server.url)
         reply = client.ask("infer", {"observation": seen(0, 0)})
-        client.close()
     assert reply["payload"]["code"] == "infer_failed"
     assert "ZeroDivisionError" not in str(reply)
     assert "ZeroDivisionError" in caplog.text, "the log of the server has it"

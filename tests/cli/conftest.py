@@ -1,70 +1,29 @@
-from pathlib import Path
-
 import deployed
-import numpy as np
 import pytest
 import torch
 from PIL import Image
+from recordings import record
 
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.data.folder import episode_path, write_seeds
-from ugr_lightning.data.formats.robotwin import write_episode
-from ugr_lightning.embodiment import CAMERAS
 from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.results.results import EpisodeResult, append_result
 
-ROOT = Path(__file__).parents[2]
-
-
-def write_demonstration(folder, index, steps=12, numbers=None):
-    """A made-up episode of 8x12 pictures; its numbers are drawn by its index, or by another number."""
-    rng = np.random.default_rng(index if numbers is None else numbers)
-    cameras = {
-        name: {"intrinsic_cv": np.eye(3), "extrinsic_cv": np.eye(3, 4), "cam2world_gl": np.eye(4)} for name in CAMERAS
-    }
-    write_episode(
-        episode_path(folder, index),
-        images=rng.integers(0, 255, (steps + 1, 3, 8, 12, 3), dtype=np.uint8),
-        commanded=rng.normal(size=(steps + 1, 14)).astype(np.float32),
-        measured=np.zeros((steps + 1, 14), np.float32),
-        endpose=np.zeros((steps + 1, 2, 7)),
-        contacts=np.zeros((steps + 1, 2), bool),
-        expert_action=rng.normal(size=(steps, 14)).astype(np.float32),
-        phase=["move"] * steps,
-        slack=np.zeros(steps, np.float32),
-        camera_parameters=cameras,
-        task="click_alarmclock",
-        setting="demo_clean",
-        seed=index,
-        control_hz=25.0,
-    )
-
-
-@pytest.fixture
-def demonstrate():
-    """Writes a made-up episode."""
-    return write_demonstration
+DEMONSTRATION = {"steps": 12, "longer": 0, "size": (8, 12)}
 
 
 @pytest.fixture(scope="session")
 def recording(tmp_path_factory):
     """Root of a recording of five made-up demonstrations."""
     root = tmp_path_factory.mktemp("data")
-    folder = root / "click_alarmclock" / "demo_clean"
-    for index in range(5):
-        write_demonstration(folder, index)
-    write_seeds(folder, range(5))
+    record(root, **DEMONSTRATION)
     return root
 
 
 @pytest.fixture
 def ten_demonstrations(tmp_path):
     """Root of a recording of ten made-up demonstrations: two of them validate."""
-    folder = tmp_path / "ten" / "click_alarmclock" / "demo_clean"
-    for index in range(10):
-        write_demonstration(folder, index)
-    write_seeds(folder, range(10))
+    record(tmp_path / "ten", 10, **DEMONSTRATION)
     return tmp_path / "ten"
 
 

@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from folders import files_of
+from recordings import record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ugr_lightning.cli.main import main
-from ugr_lightning.data.folder import write_seeds
 from ugr_lightning.system.lock import locked
 
 RUN = Path("runs/tiny/version_0")
@@ -68,10 +69,6 @@ def test_a_fit_that_goes_on_from_last_equals_the_uninterrupted_one(tiny_config, 
     assert not (RUN.parent / "version_1").exists(), "it went on in its own folder"
 
 
-def everything_in(folder):
-    return {path: path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
 def test_two_trainings_of_one_run_at_once_get_a_folder_each(tiny_config, monkeypatch):
     from tiny import TinyPolicy
 
@@ -95,10 +92,10 @@ def test_two_trainings_of_one_run_at_once_get_a_folder_each(tiny_config, monkeyp
 def test_a_run_that_is_being_trained_cannot_be_gone_on_with(tiny_config, capsys):
     fit(tiny_config, "--trainer.max_steps", "3")
     with locked(RUN / "run.lock", "the run"):
-        before = everything_in(RUN)
+        before = files_of(RUN)
         assert main(["fit", "--config", tiny_config, "--checkpoint", "last"]) == 2
         assert f"process {os.getpid()}" in capsys.readouterr().err
-        assert everything_in(RUN) == before
+        assert files_of(RUN) == before
     fit(tiny_config, "--checkpoint", "last")
 
 
@@ -116,12 +113,12 @@ def test_a_config_that_was_saved_starts_a_run_of_its_own_from_any_folder(tiny_co
     run = Path.cwd() / "saved" / "tiny" / "version_0"
     if resumed:
         fit(tiny_config, *here, "--checkpoint", "last", "--trainer.max_steps", "9")
-    before = everything_in(run)
+    before = files_of(run)
     (tmp_path / "elsewhere").mkdir()
     monkeypatch.chdir(tmp_path / "elsewhere")
     fit(str(run / "config.yaml"), "--run", "other", "--seed_everything", "1")
     fit(str(run / "config.yaml"))
-    assert everything_in(run) == before
+    assert files_of(run) == before
     assert {path.parent.parent.name for path in run.parents[1].rglob("last.ckpt")} == {"tiny", "other"}
     assert (run.parent / "version_1" / "last.ckpt").is_file()
     assert not list(Path.cwd().iterdir())
@@ -142,23 +139,23 @@ def test_a_run_may_be_named_or_given_as_a_folder(tiny_config, run, capsys):
 )
 def test_a_training_overwrites_nothing_but_the_last_checkpoint_that_it_goes_on_from(tiny_config, options, folder):
     fit(tiny_config, "--trainer.max_steps", "3")
-    before = everything_in(RUN)
+    before = files_of(RUN)
     which = "last" if options == ["--run", "other"] else "best"
     fit(tiny_config, *options, "--checkpoint", str(RUN / {"last": "last.ckpt", "best": "policy_best.ckpt"}[which]))
-    assert everything_in(RUN) == before
+    assert files_of(RUN) == before
     assert torch.load(Path("runs") / folder / "last.ckpt", weights_only=True)["global_step"] == 6
 
 
 @pytest.mark.parametrize("command", ["fit", "validate"])
 def test_a_policy_of_another_size_is_refused_in_one_sentence_before_anything_changes(tiny_config, command, capsys):
     fit(tiny_config)
-    before = everything_in(Path("runs"))
+    before = files_of(Path("runs"))
     wider = ["--model.policy.init_args.width", "16"]
     assert main([command, "--config", tiny_config, *wider, "--checkpoint", "last"]) == 2
     error = capsys.readouterr().err
     assert error.partition(f"ugr {command}: ")[2].count("\n") == 2
     assert "trunk.0.weight (16, 14), got trunk.0.weight (8, 14)" in error
-    assert everything_in(Path("runs")) == before
+    assert files_of(Path("runs")) == before
 
 
 HONOURED = {
@@ -202,20 +199,17 @@ REFUSED = {
 @pytest.mark.parametrize("key", REFUSED)
 def test_what_is_learned_from_may_not_change_and_is_named(tiny_config, capsys, key):
     fit(tiny_config, "--trainer.max_steps", "3")
-    before = everything_in(Path("runs"))
+    before = files_of(Path("runs"))
     assert main(["fit", "--config", tiny_config, "--checkpoint", "last", f"--{key}", REFUSED[key]]) == 2
     error = capsys.readouterr().err
     assert key.removeprefix("model.policy.init_args.") in error
     assert error.partition("ugr fit: ")[2].count("\n") == 2
-    assert everything_in(Path("runs")) == before
+    assert files_of(Path("runs")) == before
 
 
-def test_other_episodes_under_the_same_names_are_refused(tiny_config, tmp_path, capsys, demonstrate):
+def test_other_episodes_under_the_same_names_are_refused(tiny_config, tmp_path, capsys):
     fit(tiny_config, "--trainer.max_steps", "3")
-    folder = tmp_path / "others" / "click_alarmclock" / "demo_clean"
-    for index in range(5):
-        demonstrate(folder, index, numbers=index + 100)
-    write_seeds(folder, range(5))
+    record(tmp_path / "others", steps=12, longer=0, size=(8, 12), first_draw=100)
     assert main(["fit", "--config", tiny_config, "--checkpoint", "last", "--data.root", str(tmp_path / "others")]) == 2
     assert "others with the same names" in capsys.readouterr().err
 

@@ -5,6 +5,8 @@ import shutil
 
 import numpy as np
 import pytest
+from folders import files_of
+from recordings import record
 
 from ugr_lightning.data.conversion import NOTE, convert, left_out
 from ugr_lightning.data.formats import detect, find_format, formats
@@ -28,12 +30,8 @@ def read_all(folder):
     return [form.read(location, CAMERAS) for location in form.find(folder).values()]
 
 
-def content(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
 @pytest.fixture(scope="module")
-def recording(record, tmp_path_factory):
+def recording(tmp_path_factory):
     """Three recordings of 5, 8 and 11 steps; not to be changed."""
     return record(tmp_path_factory.mktemp("source"), count=3, steps=5)
 
@@ -45,7 +43,7 @@ def test_the_formats_that_can_be_written_are_known():
 @pytest.mark.parametrize("name", WRITTEN)
 def test_states_and_actions_are_exact_and_pictures_within_the_codecs_bound(name, recording, tmp_path):
     skip_without_extra(name)
-    before = content(recording)
+    before = files_of(recording)
     said = []
     given = convert(recording, tmp_path / "out", name, done=lambda *progress: said.append(progress))
     assert detect(tmp_path / "out").name == name
@@ -57,7 +55,7 @@ def test_states_and_actions_are_exact_and_pictures_within_the_codecs_bound(name,
             assert error.mean() <= 4 if name == "lerobot" else error.max() == 0
     assert said == [(what, number, 3) for what in ("reading", "writing", "checking") for number in (1, 2, 3)]
     assert not list((tmp_path / "out").rglob("*.partial"))
-    assert content(recording) == before
+    assert files_of(recording) == before
 
 
 @pytest.mark.parametrize("name", WRITTEN)
@@ -115,7 +113,7 @@ def test_stopped_anywhere_it_leaves_whole_episodes_and_goes_on_to_the_same_resul
 ):
     skip_without_extra(name)
     whole = convert(recording, tmp_path / "whole", name)
-    expected = content(tmp_path / "whole")
+    expected = files_of(tmp_path / "whole")
     renames = len(expected)
     assert renames >= 4
     for call in range(1, renames + 1) if name != "lerobot" else (1, 5, renames):
@@ -124,12 +122,12 @@ def test_stopped_anywhere_it_leaves_whole_episodes_and_goes_on_to_the_same_resul
             _stop_at(patch, call)
             with pytest.raises(KeyboardInterrupt):
                 convert(recording, out, name)
-        there = {path: data for path, data in content(out).items() if not path.endswith(".partial")}
+        there = {path: data for path, data in files_of(out).items() if not path.endswith(".partial")}
         assert len(there) == call - 1
         assert all(expected[path] == data for path, data in there.items())
         times = {path: (out / path).stat().st_mtime_ns for path in there if path != NOTE}
         assert len(convert(recording, out, name)) == len(whole)
-        assert content(out) == expected
+        assert files_of(out) == expected
         kept = {path for path, then in times.items() if (out / path).stat().st_mtime_ns == then}
         assert kept >= {path for path in times if path.endswith(".hdf5")}
 
@@ -186,10 +184,10 @@ def test_a_folder_with_something_else_is_refused_and_left_alone(case, recording,
     shutil.copytree(recording, tmp_path / "source")
     make, message = OTHERS[case]
     make(tmp_path / "out")
-    before = content(tmp_path)
+    before = files_of(tmp_path)
     with pytest.raises((ConfigError, DataError), match=message):
         convert(tmp_path / "source", tmp_path / "out", "act")
-    assert content(tmp_path) == before
+    assert files_of(tmp_path) == before
 
 
 def test_the_source_is_no_target_and_a_changed_source_is_another_conversion(recording, tmp_path):

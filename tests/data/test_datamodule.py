@@ -4,6 +4,7 @@ import lightning
 import pytest
 import torch
 from jsonargparse import ArgumentParser
+from recordings import prepared, record
 from torch import nn
 
 from ugr_lightning.data import datamodule
@@ -20,10 +21,7 @@ def _data(root, **options):
 
 
 def _ready(root, **options):
-    data = _data(root, **options)
-    data.prepare_data()
-    data.setup("fit")
-    return data
+    return prepared(_data(root, **options))
 
 
 def _epochs(data, count=2):
@@ -106,7 +104,7 @@ def test_reading_many_demonstrations_says_how_far_it_is(recording_root, monkeypa
     assert "click_alarmclock/demo_clean: 5/5" in capsys.readouterr().err
 
 
-def test_missing_episodes_are_recorded(tmp_path, record):
+def test_missing_episodes_are_recorded(tmp_path):
     data = _data(tmp_path, task="handover_block")
     asked = []
 
@@ -123,7 +121,7 @@ def test_missing_episodes_are_recorded(tmp_path, record):
     assert len(data.demonstrations) == 5
 
 
-def test_missing_episodes_without_a_recorder_say_which_command_to_run(tmp_path, record):
+def test_missing_episodes_without_a_recorder_say_which_command_to_run(tmp_path):
     record(tmp_path, count=3)
     with pytest.raises(DataError, match=r"5 demonstrations, got 3.*ugr collect click_alarmclock --episodes 5"):
         _data(tmp_path).prepare_data()

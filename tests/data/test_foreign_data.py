@@ -7,6 +7,7 @@ import lightning
 import numpy as np
 import pytest
 import torch
+from recordings import prepared, record
 
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.folder import find_episodes
@@ -24,7 +25,7 @@ TINY = {"dim": 16, "feedforward": 16, "heads": 2, "encoder_layers": 1, "decoder_
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory, record):
+def folders(tmp_path_factory):
     """Five recordings, the same as processed ACT, and those as recordings again."""
     root = tmp_path_factory.mktemp("conversion")
     ours = record(root)
@@ -99,10 +100,8 @@ def test_one_arm_with_one_camera_trains(folders):
 @pytest.mark.parametrize("cache", ["memmap", "none"])
 def test_the_caches_deliver_foreign_pictures(cache, folders, tmp_path):
     shutil.copytree(folders["act"], tmp_path / "act")
-    plain, cached = _data(folders["ours"]), _data(tmp_path / "act", cache=cache, num_workers=0)
-    for data in (plain, cached):
-        data.prepare_data()
-        data.setup()
+    plain = prepared(_data(folders["ours"]))
+    cached = prepared(_data(tmp_path / "act", cache=cache, num_workers=0))
     frames = list(range(0, 30, 7))
     assert torch.equal(cached.data[frames].images, plain.data[frames].images)
     assert {path.name for path in tmp_path.iterdir()} == {"act"}
@@ -113,9 +112,7 @@ def test_a_memmap_of_one_layout_is_not_taken_for_another(folders, tmp_path):
     seen = []
     for camera in ("cam_high", "cam_left_wrist"):
         data = _data(tmp_path / "act", cache="memmap", cameras=("view",), layout=Layout(cameras={"view": camera}))
-        data.prepare_data()
-        data.setup()
-        seen.append(data.data[[0]].images)
+        seen.append(prepared(data).data[[0]].images)
     assert not torch.equal(*seen)
 
 
@@ -124,9 +121,7 @@ def test_a_folder_of_another_format_under_the_root_is_read_and_never_recorded_in
     shutil.copytree(folders["act"], place)
     data = ChunkDataModule(root=str(tmp_path), episodes=5, chunk_length=4)
     data.recorder = lambda module: pytest.fail("recorded into a foreign folder")
-    data.prepare_data()
-    data.setup()
-    assert len(data.demonstrations) == 5
+    assert len(prepared(data).demonstrations) == 5
     more = ChunkDataModule(root=str(tmp_path), episodes=9)
     more.recorder = data.recorder
     with pytest.raises(DataError, match=r"9 demonstrations, got 5\. Set `data\.episodes` to 5 or less"):

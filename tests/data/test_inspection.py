@@ -5,6 +5,8 @@ import re
 import h5py
 import numpy as np
 import pytest
+from foreign_files import marked_jpeg
+from recordings import arrays
 
 from ugr_lightning.data.folder import episode_path, write_seeds
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
@@ -34,7 +36,7 @@ def scene(frames):
 
 
 @pytest.fixture
-def make(tmp_path, arrays):
+def make(tmp_path):
     """Writes one episode of a folder whose episodes have nothing odd; changes replace arrays."""
 
     def make(index=0, seed=None, **changes):
@@ -56,7 +58,7 @@ def test_nothing_is_odd_about_good_demonstrations(make):
     assert oddities(make(0)) == []
 
 
-def test_pictures_show_the_next_keyframes_and_what_is_not_in_them(make, arrays):
+def test_pictures_show_the_next_keyframes_and_what_is_not_in_them(make):
     poses = np.zeros((STEPS + 1, 2, 7))
     poses[..., :3] = [[-0.2, 0, 0], [0.2, 0, -2]]  # the right tool is behind the camera
     parameters = arrays()["camera_parameters"]
@@ -179,10 +181,6 @@ def _swap_one():
     return {"images": frames}
 
 
-def _mark(jpeg):
-    return jpeg[:2] + b"\xff\xfe\x00\x0aXPL-RGB1" + jpeg[2:]
-
-
 ODD = {
     "a constant joint": (_changed(3, slice(None), 0.2), "state never moves in left_joint_4"),
     "a gripper in metres beyond 1": (_changed(6, slice(4, 6), 1.5), r"left_gripper is outside 0.*0\.\d+ to 1\.5"),
@@ -207,9 +205,7 @@ def test_what_is_odd_is_found_and_nothing_else(case, make):
 
 def test_an_episode_in_other_colours_than_the_first_contradicts_its_mark(make):
     make(0)
-    marked = [
-        [_mark(jpeg) for jpeg in encode_frame(frame)] for frame in scene(STEPS + 1)
-    ]  # swapped, and said not to be
+    marked = [list(map(marked_jpeg, encode_frame(frame))) for frame in scene(STEPS + 1)]  # swapped, and said not to be
     (line, *more) = oddities(make(1, images=marked))
     assert line.startswith("cam_high shows red and blue swapped, compared with episode 0, in the episodes 1")
     assert len(more) == 2
@@ -217,7 +213,7 @@ def test_an_episode_in_other_colours_than_the_first_contradicts_its_mark(make):
 
 def test_right_marks_of_both_kinds_are_only_mentioned(make):
     make(0)
-    marked = [[_mark(jpeg) for jpeg in encode_frame(frame[..., ::-1])] for frame in scene(STEPS + 1)]
+    marked = [list(map(marked_jpeg, encode_frame(frame[..., ::-1]))) for frame in scene(STEPS + 1)]
     found = oddities(make(1, images=marked))
     assert len(found) == 3
     assert all("with and without the mark" in line for line in found)

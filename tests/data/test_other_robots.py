@@ -9,6 +9,7 @@ import h5py
 import numpy as np
 import pytest
 from foreign_files import pictures, waves, write_act, write_maniskill, write_robotwin
+from recordings import prepared
 
 from ugr_lightning.data.conversion import convert
 from ugr_lightning.data.datamodule import ChunkDataModule
@@ -23,9 +24,7 @@ from ugr_lightning.errors import ConfigError, DataError
 def first_batch(folder, cameras, **options):
     """One batch of training on a folder."""
     data = ChunkDataModule(folder=str(folder), cameras=cameras, episodes=4, chunk_length=5, batch_size=3, **options)
-    data.prepare_data()
-    data.setup()
-    return next(iter(data.train_dataloader()))
+    return next(iter(prepared(data).train_dataloader()))
 
 
 ROBOTS = {

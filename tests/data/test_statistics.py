@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from recordings import arrays, record
 
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.episode import Episode
@@ -52,7 +53,7 @@ def test_small_differences_on_a_large_offset_survive(recording_root):
     assert torch.allclose(found, torch.tensor(0.5), atol=1e-3)
 
 
-def test_changing_validation_episodes_leaves_statistics_bit_identical(tmp_path, record, arrays):
+def test_changing_validation_episodes_leaves_statistics_bit_identical(tmp_path):
     folder = record(tmp_path)
 
     def statistics():

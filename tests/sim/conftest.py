@@ -1,14 +1,8 @@
-import os
-
-os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 import numpy as np
 import pytest
-import torch
 
 from ugr_lightning.sim.sapien_simulator import SapienSimulator
 
-torch.set_num_threads(1)
 TINY = (30, 40)
 
 

@@ -31,6 +31,11 @@ def swapped_jpeg(picture):
     return out.getvalue()
 
 
+def marked_jpeg(jpeg):
+    """The same picture with the mark of true RGB, as XPolicyLab stores them."""
+    return jpeg[:2] + b"\xff\xfe\x00\x0aXPL-RGB1" + jpeg[2:]
+
+
 def jpeg_rows(jpegs):
     """Rows of bytes, with zeros behind."""
     rows = np.zeros((len(jpegs), max(map(len, jpegs))), np.uint8)

@@ -37,7 +37,7 @@ def _predict(
     from ugr_lightning.results.tables import as_text
     from ugr_lightning.training.runs import resolve_checkpoint
     from ugr_lightning.uncertainty import open_loop as kit
-    from ugr_lightning.uncertainty.predictions import STD_FLOOR, open_data
+    from ugr_lightning.uncertainty.predictions import open_data
     from ugr_lightning.uncertainty.study import write_page
 
     file = resolve_checkpoint(checkpoint, run, root)
@@ -51,7 +51,7 @@ def _predict(
         got = ", ".join(f"{len(part)} {name}" for name, part in parts.items())
         raise ConfigError("--tasks", "tasks with training and validation episodes", got, "Choose more tasks.")
     followed = {name: kit.follow(fast, opened, chosen, stride=stride) for name, chosen in parts.items()}
-    std = opened.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
+    std = opened.statistics.action_std.numpy()  # (A,)
     errors = kit.compare_parts(followed["training"], followed["validation"], std)
     says = kit.conclusion(errors, (len(parts["training"]), len(parts["validation"])))
     table = kit.error_table(errors)

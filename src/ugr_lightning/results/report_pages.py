@@ -104,11 +104,9 @@ def _counted(successes: int, n: int) -> str:
 def _rate_table(rates: Sequence[Rate]) -> Cells:
     rows: Cells = [("task", "policy", "success", "95 % interval", "by training seed", "crashed")]
     for rate in rates:
-        total = rate.total
         seeds = ", ".join(f"{seed}: {part.successes}/{part.n}" for seed, part in rate.by_training_seed.items())
-        success = f"{total.successes}/{total.n} = {total.rate:.1%}"
-        interval = f"[{total.low:.1%}, {total.high:.1%}]"
-        rows.append((rate.task, f"`{rate.policy}`", success, interval, seeds, str(total.crashed)))
+        success, interval, crashed = rate.total.cells()
+        rows.append((rate.task, f"`{rate.policy}`", success, interval, seeds, crashed))
     return rows
 
 

@@ -122,6 +122,10 @@ class Summary(NamedTuple):
         text = f"{self.successes}/{self.n} = {self.rate:.0%} [{self.low:.0%}, {self.high:.0%}]"
         return text + (f", {self.crashed} crashed" if self.crashed else "")
 
+    def cells(self) -> tuple[str, str, str]:
+        """The rate, its interval and how many crashed, as tables show them."""
+        return f"{self.successes}/{self.n} = {self.rate:.1%}", f"[{self.low:.1%}, {self.high:.1%}]", str(self.crashed)
+
 
 def summarize(results: Iterable[EpisodeResult]) -> Summary:
     """Count the successes of some episodes and put the 95 % Wilson interval beside the rate."""
@@ -137,11 +141,7 @@ def success_table(results: Sequence[EpisodeResult]) -> str:
     for result in results:
         groups.setdefault((result.task, result.setting, result.policy, result.execution), []).append(result)
     rows = [("task", "setting", "policy", "execution", "success", "95 % interval", "crashed")]
-    for key, group in groups.items():
-        total = summarize(group)
-        interval = f"[{total.low:.1%}, {total.high:.1%}]"
-        rows.append((*key, f"{total.successes}/{total.n} = {total.rate:.1%}", interval, str(total.crashed)))
-    return as_text(rows)
+    return as_text(rows + [(*key, *summarize(group).cells()) for key, group in groups.items()])
 
 
 def append_result(path: str | Path, result: EpisodeResult) -> None:

@@ -57,9 +57,7 @@ HEAD = ("success", "95 % interval", "crashed", "difference", "only here / only f
 
 def use_cells(use: Use) -> tuple[str, ...]:
     """What `HEAD` names, for one way."""
-    total, against = use.total, use.against
-    success = f"{total.successes}/{total.n} = {total.rate:.1%}"
-    cells = (success, f"[{total.low:.1%}, {total.high:.1%}]", str(total.crashed))
+    cells, against = use.total.cells(), use.against
     if against is None:
         return (*cells, "", "", "", "")
     difference = f"{against.difference:+.1%} [{against.low:+.1%}, {against.high:+.1%}]"

@@ -18,7 +18,7 @@ from ugr_lightning.models.transformer import Dropout, drop
 from ugr_lightning.results.tables import Cells
 from ugr_lightning.rollout.overlap import Overlap
 from ugr_lightning.uncertainty import calibration as kit
-from ugr_lightning.uncertainty.predictions import STD_FLOOR, Predictions, batches
+from ugr_lightning.uncertainty.predictions import Predictions, batches
 
 Draw = Callable[[Observation], Chunk]
 
@@ -39,7 +39,7 @@ def sampled_deviation(
     Returns:
         (n, K) root of the variance, summed over the action, of the coarse actions.
     """
-    std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
+    std = data.statistics.action_std  # (A,)
     found = []
     for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
         chunks = [draw(batch.observation) for _ in range(samples)]
@@ -108,7 +108,7 @@ def estimate(
         probability: dropout in layers that were trained without it.
         seed: of the random numbers; the state of the global generator is put back.
     """
-    std = data.statistics.action_std.clamp_min(STD_FLOOR).numpy()  # (A,)
+    std = data.statistics.action_std.numpy()  # (A,)
     frames = data.data.frames.of(episodes, stride)
     episode, step = data.data.frames.locate(frames)
     chunks = [policy.predict(data.data.__getitems__([frame]).observation) for frame in frames.tolist()]

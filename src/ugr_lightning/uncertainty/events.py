@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ugr_lightning.data.episode import Episode
+from ugr_lightning.data.keyframes import HALF_OPEN
 from ugr_lightning.embodiment import ACTION_DIM, GRIPPERS
 
-HALF_OPEN = 0.5
 KINDS = ("contact", "release", "close", "open")
 
 

@@ -14,7 +14,7 @@ from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.errors import DataError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.uncertainty.calibration import Interval, bootstrap
-from ugr_lightning.uncertainty.predictions import STD_FLOOR, batches
+from ugr_lightning.uncertainty.predictions import batches
 
 PENALTIES = (1e-4, 1e-3, 1e-2, 1e-1, 1.0, 10.0)
 """Ridge penalties that are tried, on standardised features; the best one is chosen on the episodes that are fitted."""
@@ -90,7 +90,7 @@ def _steps(
     policy: ACT, data: ChunkDataModule, episodes: tuple[int, ...], stride: int
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """For each episode, what the branch sees (n, D + A) and what the coarse actions miss (n, A), in deviations."""
-    std, hidden = data.statistics.action_std.clamp_min(STD_FLOOR), []  # (A,), of (B, K, D)
+    std, hidden = data.statistics.action_std, []  # (A,), of (B, K, D)
     hook = policy.decoder_norm.register_forward_hook(lambda layer, given, out: hidden.append(out.float().numpy()))
     try:
         for episode in episodes:

@@ -14,8 +14,6 @@ from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.errors import DataError
 from ugr_lightning.models.checkpoint import TrainingData
 
-STD_FLOOR = 1e-2  # as in the policies' normalisation
-
 
 class Predictions(NamedTuple):
     """Errors and uncertainties of n chunks, in standard deviations of the training actions; NaN on padded steps.
@@ -62,7 +60,7 @@ def predict(
     Returns:
         Predictions in the order of episode and step.
     """
-    std = data.statistics.action_std.clamp_min(STD_FLOOR)  # (A,)
+    std = data.statistics.action_std  # (A,)
     parts: list[Predictions] = []
     for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
         with torch.no_grad():

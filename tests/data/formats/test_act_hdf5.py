@@ -4,6 +4,7 @@ import h5py
 import numpy as np
 import pytest
 from foreign_files import ACT_CAMERAS, pictures, replace, waves, write_act
+from recordings import record
 
 from ugr_lightning.data.formats import EpisodeLocation, detect, find_format
 from ugr_lightning.data.formats.robotwin import read_episode
@@ -169,7 +170,7 @@ def test_velocities_that_were_not_recorded_are_differences_of_the_joints(tmp_pat
     assert not list((tmp_path / "again").glob("*.hdf5"))
 
 
-def test_a_folder_of_another_format_is_not_written_into(tmp_path, record):
+def test_a_folder_of_another_format_is_not_written_into(tmp_path):
     folder = record(tmp_path, count=2)
     with pytest.raises(DataError, match="a folder for act, got demonstrations of robotwin"):
         find_format("act").write(folder, [read_episode(folder / "data" / "episode0.hdf5")])

@@ -6,6 +6,7 @@ import shutil
 import h5py
 import numpy as np
 import pytest
+from recordings import record
 
 from ugr_lightning.data.formats import EpisodeFormat, detect, find_format, formats, recognise
 from ugr_lightning.data.formats.robotwin import read_episode
@@ -34,7 +35,7 @@ def test_nothing_recognises_nothing(tmp_path):
         assert recognise(folder) == []
 
 
-def test_the_name_of_a_folder_means_nothing(tmp_path, record):
+def test_the_name_of_a_folder_means_nothing(tmp_path):
     shutil.move(record(tmp_path, count=2), tmp_path / "act")
     assert detect(tmp_path / "act").name == "robotwin"
     assert detect(tmp_path / "act" / "data").name == "robotwin"
@@ -43,7 +44,7 @@ def test_the_name_of_a_folder_means_nothing(tmp_path, record):
     assert [location.path for location in detect(single).find(single).values()] == [single]
 
 
-def test_one_damaged_file_does_not_hide_the_format(tmp_path, record):
+def test_one_damaged_file_does_not_hide_the_format(tmp_path):
     folder = record(tmp_path, count=3)
     first = folder / "data" / "episode0.hdf5"
     first.write_bytes(first.read_bytes()[:1000])
@@ -53,7 +54,7 @@ def test_one_damaged_file_does_not_hide_the_format(tmp_path, record):
         form.read(form.find(folder)[0], ("cam_high",))
 
 
-def test_a_mixed_folder_is_refused(tmp_path, record):
+def test_a_mixed_folder_is_refused(tmp_path):
     folder = record(tmp_path, count=2)
     find_format("act").write(tmp_path / "act", [read_episode(folder / "data" / "episode0.hdf5")])
     shutil.copy(tmp_path / "act" / "episode_0.hdf5", folder / "data" / "episode_5.hdf5")

@@ -7,6 +7,7 @@ import pickle
 import numpy as np
 import pytest
 from PIL import Image
+from recordings import prepared
 
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.formats import detect
@@ -233,9 +234,7 @@ def test_a_data_module_gives_the_rows_of_the_dataset_with_every_cache(tmp_path):
     batches = []
     for cache in ("none", "ram", "memmap"):
         data = ChunkDataModule(folder=str(folder), episodes=4, batch_size=5, cache=cache, chunk_length=6)
-        data.prepare_data()
-        data.setup()
-        batches.append(next(iter(data.train_dataloader())))
+        batches.append(next(iter(prepared(data).train_dataloader())))
     for batch in batches:
         for row in range(5):
             index, step = int(batch.episode[row]), int(batch.step[row])
@@ -396,9 +395,7 @@ def test_one_task_of_a_hub_cache_is_trained_on_from_its_folder_or_its_snapshot(t
     snapshot = _to_hub_cache(tmp_path / "source", tmp_path / "datasets--x")
     for folder in (snapshot, tmp_path / "datasets--x"):
         data = ChunkDataModule(folder=str(folder), episodes=2, tasks="*1", chunk_length=3, batch_size=2)
-        data.prepare_data()
-        data.setup()
-        assert [episode.name for episode in data.demonstrations] == ["episode1", "episode3"]
+        assert [episode.name for episode in prepared(data).demonstrations] == ["episode1", "episode3"]
         assert np.array_equal(data.demonstrations[1].action, joints(3, 1))
         assert data.control_hz == FPS
         assert "2 of 4 demonstrations are used" in capsys.readouterr().err

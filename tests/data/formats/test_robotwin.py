@@ -6,8 +6,9 @@ import io
 import h5py
 import numpy as np
 import pytest
-from foreign_files import poke, replace
+from foreign_files import marked_jpeg, poke, replace, swapped_jpeg
 from PIL import Image
+from recordings import arrays
 
 from ugr_lightning.data.folder import episode_path
 from ugr_lightning.data.formats import detect, find_format, robotwin
@@ -21,7 +22,7 @@ VECTOR = "joint_action/vector"
 HEAD = "observation/head_camera/rgb"
 
 
-def test_the_numbers_of_an_episode_come_back_exactly(tmp_path, arrays):
+def test_the_numbers_of_an_episode_come_back_exactly(tmp_path):
     given = arrays(steps=9, seed=4)
     write_episode(episode_path(tmp_path, 4), **given)
     episode = read_episode(episode_path(tmp_path, 4))
@@ -36,7 +37,7 @@ def test_the_numbers_of_an_episode_come_back_exactly(tmp_path, arrays):
     assert episode.extras["control_hz"] == 25.0
 
 
-def test_pictures_come_back_in_true_rgb_and_in_the_order_asked_for(tmp_path, arrays):
+def test_pictures_come_back_in_true_rgb_and_in_the_order_asked_for(tmp_path):
     given = arrays(steps=3)
     write_episode(episode_path(tmp_path, 0), **given)
     for step in range(3):
@@ -46,7 +47,7 @@ def test_pictures_come_back_in_true_rgb_and_in_the_order_asked_for(tmp_path, arr
     assert np.abs(swapped - given["images"][1][[2, 0]]).max() <= 8
 
 
-def test_files_have_robotwins_colour_order_for_other_viewers(tmp_path, arrays):
+def test_files_have_robotwins_colour_order_for_other_viewers(tmp_path):
     images = np.zeros((2, 3, 24, 32, 3), np.uint8)
     images[..., 0] = 200  # red
     write_episode(episode_path(tmp_path, 0), **arrays(steps=1, images=images))
@@ -56,13 +57,10 @@ def test_files_have_robotwins_colour_order_for_other_viewers(tmp_path, arrays):
     assert seen[12, 16, 0] < 10
 
 
-def test_jpegs_marked_as_true_rgb_are_not_swapped(tmp_path, arrays):
+def test_jpegs_marked_as_true_rgb_are_not_swapped(tmp_path):
     images = np.zeros((3, 24, 32, 3), np.uint8)
     images[..., 0] = 200
-    marked = []
-    for image in images:
-        jpeg = encode_jpeg(image[..., ::-1])  # true RGB on disk
-        marked.append(jpeg[:2] + b"\xff\xfe\x00\x0aXPL-RGB1" + jpeg[2:])
+    marked = [marked_jpeg(encode_jpeg(image[..., ::-1])) for image in images]  # true RGB on disk
     write_episode(episode_path(tmp_path, 0), **arrays(steps=1, images=[marked, marked]))
     assert read_episode(episode_path(tmp_path, 0)).images(0)[0, 12, 16].tolist()[0] > 190
 
@@ -76,7 +74,7 @@ def test_tool_poses_are_those_without_noise_where_a_file_tells_them(tmp_path, ar
     np.testing.assert_allclose(read_episode(tmp_path / "noisy.hdf5").endpose, meant, rtol=1e-6)
 
 
-def test_the_layout_on_disk_is_robotwins(episode_file, arrays):
+def test_the_layout_on_disk_is_robotwins(episode_file):
     given = arrays()
     with h5py.File(episode_file) as file:
         assert file[VECTOR].shape == (13, 14)
@@ -99,7 +97,7 @@ def test_the_layout_on_disk_is_robotwins(episode_file, arrays):
             assert file[f"observation/{camera}/cam2world_gl"].shape == (13, 4, 4)
 
 
-def test_encoded_frames_are_stored_as_they_are(tmp_path, arrays):
+def test_encoded_frames_are_stored_as_they_are(tmp_path):
     given = arrays(steps=2)
     jpegs = [encode_frame(frame) for frame in given["images"]]
     write_episode(episode_path(tmp_path, 0), **{**given, "images": jpegs})
@@ -114,7 +112,7 @@ def test_texts_are_stored_with_fixed_width_and_read_with_any(episode_file):
     assert read_episode(episode_file).extras["task"] == "text of variable width"
 
 
-def test_moving_cameras_keep_their_parameters_of_each_frame(tmp_path, arrays):
+def test_moving_cameras_keep_their_parameters_of_each_frame(tmp_path):
     given = arrays(steps=2)
     moving = []
     for frame in range(3):
@@ -126,7 +124,7 @@ def test_moving_cameras_keep_their_parameters_of_each_frame(tmp_path, arrays):
         assert file["observation/left_camera/extrinsic_cv"][:, 0, 0].tolist() == [0, 1, 2]
 
 
-def test_without_an_expert_action_the_label_is_the_next_command(episode_file, arrays):
+def test_without_an_expert_action_the_label_is_the_next_command(episode_file):
     with h5py.File(episode_file, "r+") as file:
         del file["ugr"]
         for name in list(file.attrs):
@@ -138,7 +136,7 @@ def test_without_an_expert_action_the_label_is_the_next_command(episode_file, ar
         episode.proprioception("measured")
 
 
-def test_a_failure_while_writing_leaves_no_file_and_keeps_the_old_one(tmp_path, arrays, monkeypatch):
+def test_a_failure_while_writing_leaves_no_file_and_keeps_the_old_one(tmp_path, monkeypatch):
     path = episode_path(tmp_path, 0)
     write_episode(path, **arrays(seed=1))
     before = path.read_bytes()
@@ -173,7 +171,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "value"), WRONG)
-def test_wrong_arguments_are_refused_before_anything_is_written(name, value, tmp_path, arrays):
+def test_wrong_arguments_are_refused_before_anything_is_written(name, value, tmp_path):
     with pytest.raises(DataError, match=name):
         write_episode(episode_path(tmp_path, 0), **arrays(**{name: value}))
     assert not list(tmp_path.rglob("*.*"))
@@ -288,15 +286,9 @@ def _theirs(folder, spelling, frames=6, arm=6, count=3):
                 file[f"endpose/{side}_gripper"] = vector[:, start + arm]
             file["joint_action/vector"] = vector
             for view, camera in enumerate(("front_camera", "head_camera", "left_camera", "right_camera")):
-                stored = []
-                for frame in range(frames):
-                    rgb = np.zeros((24, 32, 3), np.uint8)
-                    rgb[:] = (200, 20 * frame, 60 * view)
-                    buffer = io.BytesIO()
-                    Image.fromarray(rgb[..., ::-1]).save(buffer, "JPEG", quality=95)  # red and blue swapped
-                    stored.append(buffer.getvalue())
-                longest = max(map(len, stored))
-                file.create_dataset(f"observation/{camera}/rgb", data=stored, dtype=f"S{longest}")
+                colours = np.array([(200, 20 * frame, 60 * view) for frame in range(frames)], np.uint8)
+                shown = np.tile(colours[:, None, None], (1, 24, 32, 1))  # (frames, H, W, 3)
+                file[f"observation/{camera}/rgb"] = np.array(list(map(swapped_jpeg, shown)), dtype=bytes)
             file["pointcloud"] = np.zeros((frames, 0))
     (folder / "seed.txt").write_text("4 9 11")
     return folder
@@ -374,7 +366,7 @@ def test_unknown_cameras_name_the_known_ones(cameras, episode_file):
         read_episode(episode_file, cameras)
 
 
-def test_pictures_are_checked_many_at_a_read_and_a_damaged_one_is_still_named(tmp_path, arrays, monkeypatch):
+def test_pictures_are_checked_many_at_a_read_and_a_damaged_one_is_still_named(tmp_path, monkeypatch):
     path, reads, read = episode_path(tmp_path, 0), [], h5py.Dataset.__getitem__
     write_episode(path, **arrays(steps=150))
     monkeypatch.setattr(h5py.Dataset, "__getitem__", lambda *given: reads.append(given[0].name) or read(*given))

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from recordings import arrays, record
 
 from ugr_lightning.data.folder import episode_path, find_episodes
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
@@ -25,7 +26,7 @@ def _folder(root):
 
 
 @pytest.mark.parametrize("image_size", [None, (12, 16), (7, 32)])
-def test_ram_memmap_and_no_cache_give_the_same_pictures(image_size, tmp_path, record):
+def test_ram_memmap_and_no_cache_give_the_same_pictures(image_size, tmp_path):
     episodes = _episodes(record(tmp_path, count=3))
     total = sum(episode.length for episode in episodes)
     frames = np.array([total - 1, 0, 8, 7, 6, 0])
@@ -40,7 +41,7 @@ def test_ram_memmap_and_no_cache_give_the_same_pictures(image_size, tmp_path, re
         np.testing.assert_array_equal(taken[0][0], episodes[2].images(12))
 
 
-def test_reading_without_a_cache_keeps_few_files_open(tmp_path, record, monkeypatch):
+def test_reading_without_a_cache_keeps_few_files_open(tmp_path, monkeypatch):
     monkeypatch.setattr(cache_module, "OPEN_EPISODES", 3)
     episodes = _episodes(record(tmp_path, count=8))
     store = open_frames(episodes, "none")
@@ -59,7 +60,7 @@ def test_shrinking_averages_areas(recording_root):
     assert np.abs(small - blocks).max() <= 1  # rounded once per direction
 
 
-def test_a_memmap_is_decoded_once_and_again_when_an_episode_changes(tmp_path, record, arrays, monkeypatch):
+def test_a_memmap_is_decoded_once_and_again_when_an_episode_changes(tmp_path, monkeypatch):
     folder = record(tmp_path, count=2)
     decoded = []
     original = cache_module._decode_all
@@ -91,7 +92,7 @@ def _open_slowly(folder, log):
         np.testing.assert_array_equal(store.take(np.array([step]))[0], _episodes(folder)[0].images(step))
 
 
-def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decodes(tmp_path, record):
+def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decodes(tmp_path):
     folder, log = record(tmp_path, count=2), tmp_path / "log"
     processes = [get_context("fork").Process(target=_open_slowly, args=(folder, log)) for _ in range(3)]
     for process in processes:
@@ -102,7 +103,7 @@ def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decod
     assert log.read_text() == "decoded\n"
 
 
-def test_what_a_killed_process_left_of_a_memmap_is_removed(tmp_path, record):
+def test_what_a_killed_process_left_of_a_memmap_is_removed(tmp_path):
     folder = record(tmp_path, count=2)
     open_frames(_episodes(folder), "memmap")
     (path,) = (folder / ".cache").glob("*.npy")
@@ -111,7 +112,7 @@ def test_what_a_killed_process_left_of_a_memmap_is_removed(tmp_path, record):
     assert list((folder / ".cache").glob("frames-*-*")) == [path]
 
 
-def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, record, monkeypatch):
+def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, monkeypatch):
     folder = record(tmp_path, count=2)
 
     def interrupted(*_):
@@ -125,7 +126,7 @@ def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, record, mo
     np.testing.assert_array_equal(store.take(np.array([1]))[0], _episodes(folder)[0].images(1))
 
 
-def test_a_damaged_memmap_names_the_file_and_says_what_to_do(tmp_path, record):
+def test_a_damaged_memmap_names_the_file_and_says_what_to_do(tmp_path):
     folder = record(tmp_path, count=2)
     open_frames(_episodes(folder), "memmap")
     (path,) = (folder / ".cache").glob("*.npy")
@@ -136,7 +137,7 @@ def test_a_damaged_memmap_names_the_file_and_says_what_to_do(tmp_path, record):
 
 
 @pytest.mark.parametrize("cache", ["ram", "memmap", "none"])
-def test_stores_travel_to_other_processes(cache, tmp_path, record):
+def test_stores_travel_to_other_processes(cache, tmp_path):
     store = open_frames(_episodes(record(tmp_path, count=2)), cache)
     packed = pickle.dumps(store)
     if cache == "memmap":
@@ -144,7 +145,7 @@ def test_stores_travel_to_other_processes(cache, tmp_path, record):
     np.testing.assert_array_equal(pickle.loads(packed).take(np.array([9])), store.take(np.array([9])))
 
 
-def test_episodes_of_different_sizes_are_refused(tmp_path, record, arrays):
+def test_episodes_of_different_sizes_are_refused(tmp_path):
     folder = record(tmp_path, count=2)
     write_episode(episode_path(folder, 1), **arrays(size=(16, 16)))
     with pytest.raises(DataError, match="one image size"):

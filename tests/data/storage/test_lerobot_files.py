@@ -3,6 +3,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folders import files_of
 
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import detect
@@ -55,10 +56,6 @@ def make_all(count=3, **changes):
 
 def read_all(folder):
     return [FORMAT.read(location, CAMERAS) for location in FORMAT.find(folder).values()]
-
-
-def contents(folder):
-    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture(scope="module")
@@ -139,18 +136,18 @@ def test_stopped_in_the_middle_of_a_video_the_next_call_goes_on(tmp_path, monkey
     write_dataset(folder, make_all())
     assert len(before) == 10
     assert before == {path: path.stat().st_mtime_ns for path in before}
-    assert contents(folder) == contents(tmp_path / "complete")
+    assert files_of(folder) == files_of(tmp_path / "complete")
 
 
 def test_a_finished_dataset_stays_as_it_is(tmp_path):
     write_dataset(tmp_path, make_all())
-    before = contents(tmp_path)
+    before = files_of(tmp_path)
     indices = []
     write_dataset(tmp_path, make_all(), indices.append)
     assert indices == [0, 1, 2]
     with pytest.raises(DataError, match=r"info\.json.*Choose an empty folder"):
         write_dataset(tmp_path, make_all(2))
-    assert before == contents(tmp_path)
+    assert before == files_of(tmp_path)
 
 
 @pytest.mark.parametrize("size", [(31, 47), (32, 33)])
