@@ -5,7 +5,7 @@ from PIL import Image
 from recordings import record
 
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.models.checkpoint import describe
+from ugr_lightning.models.checkpoint import describe, write_checkpoint
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.results.results import EpisodeResult, append_result
 
@@ -38,8 +38,7 @@ def untrained(ten_demonstrations):
         policy.set_statistics(data.statistics)
         weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}
         content = {"state_dict": weights, "policy": describe(policy, data), "global_step": 7, "epoch": 0}
-        folder.mkdir(parents=True, exist_ok=True)
-        torch.save(content, folder / "policy_best.ckpt")
+        write_checkpoint(folder / "policy_best.ckpt", content)
         return folder / "policy_best.ckpt"
 
     return write
@@ -58,6 +57,12 @@ def tiny_act():
         return policy
 
     return build
+
+
+@pytest.fixture
+def checkpoint(untrained, tiny_act, tmp_path):
+    """`policy_best.ckpt` of such an ACT."""
+    return untrained(tiny_act(), tmp_path)
 
 
 class Calls(list):

@@ -1,6 +1,5 @@
 """`ugr analyze` from a checkpoint to its tables and figures."""
 
-import hashlib
 import json
 
 import numpy as np
@@ -12,7 +11,7 @@ from ugr_lightning.cli.main import main
 from ugr_lightning.data.layout import Joint, Layout
 from ugr_lightning.data.split import Split
 from ugr_lightning.embodiment import CAMERAS
-from ugr_lightning.models.checkpoint import load_policy
+from ugr_lightning.models.checkpoint import load_policy, sha256
 
 
 @pytest.fixture
@@ -64,7 +63,7 @@ def test_analyze_refuses_other_episodes_than_those_of_the_split(command, ten_dem
 def test_failures_are_told_from_traces_of_this_checkpoint_alone(command, capsys, tmp_path):
     assert main([*command, "--traces", str(tmp_path)]) == 2
     assert "traces of this checkpoint" in capsys.readouterr().err
-    sha = hashlib.sha256((tmp_path / "policy_best.ckpt").read_bytes()).hexdigest()[:8]
+    sha = sha256(tmp_path / "policy_best.ckpt")[:8]
     for seed in range(30):
         success, query = seed < 20, np.arange(40)
         arrays = {"seed": seed, "success": success, "steps": 40, "query": query, "contacts": np.zeros((41, 2), bool)}
@@ -82,7 +81,7 @@ def test_failures_are_told_from_traces_of_this_checkpoint_alone(command, capsys,
 
 
 def test_too_few_traces_of_one_execution_cost_nothing_of_the_page(command, capsys, tmp_path):
-    sha = hashlib.sha256((tmp_path / "policy_best.ckpt").read_bytes()).hexdigest()[:8]
+    sha = sha256(tmp_path / "policy_best.ckpt")[:8]
     arrays = {"seed": 0, "success": True, "steps": 4, "query": np.arange(1), "contacts": np.zeros((5, 2), bool)}
     arrays |= {"chunks": np.zeros((1, 5, 14)), "log_variance": np.zeros((1, 5))}
     np.savez(tmp_path / f"click_alarmclock-{sha}-TinyPolicy-aggregate-0.npz", **arrays)

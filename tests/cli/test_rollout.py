@@ -24,9 +24,9 @@ def test_rollout_prints_rate_and_interval_and_writes_a_line_per_episode(world, t
 
 
 @pytest.mark.parametrize("command", ["rollout", "test"])
-def test_episodes_that_all_crash_are_no_result(world, tiny_act, untrained, tmp_path, capsys, command):
+def test_episodes_that_all_crash_are_no_result(world, checkpoint, tmp_path, capsys, command):
     world.crash, out = "the command is not finite", str(tmp_path / "r.jsonl")
-    assert main([command, str(untrained(tiny_act(), tmp_path)), "--episodes", "2", "--out", out]) == 2
+    assert main([command, str(checkpoint), "--episodes", "2", "--out", out]) == 2
     said = capsys.readouterr()
     assert "0/2 = 0.0%" in said.out
     assert "that crashed, the first with: the command is not finite" in said.err
@@ -55,12 +55,11 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
     assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
 
 
-def test_a_checkpoint_is_loaded_once_for_all_executions(world, tiny_act, untrained, tmp_path, monkeypatch):
+def test_a_checkpoint_is_loaded_once_for_all_executions(world, checkpoint, monkeypatch):
     loaded = []
     monkeypatch.setattr(
         "ugr_lightning.models.checkpoint.load_policy", lambda path: loaded.append(path) or load_policy(path)
     )
-    checkpoint = untrained(tiny_act(), tmp_path)
     executions = ["--executions", "[aggregate,5,10]", "--episodes", "1"]
     assert main(["test", str(checkpoint), *executions]) == 0
     assert len(world) == 3
@@ -68,10 +67,7 @@ def test_a_checkpoint_is_loaded_once_for_all_executions(world, tiny_act, untrain
     assert len(loaded) == 2
 
 
-def test_the_rate_of_the_data_is_in_the_checkpoint_and_compared_with_the_simulators(
-    world, tiny_act, untrained, tmp_path, recwarn
-):
-    checkpoint = untrained(tiny_act(), tmp_path)
+def test_the_rate_of_the_data_is_in_the_checkpoint_and_compared_with_the_simulators(world, checkpoint, recwarn):
     content = torch.load(checkpoint)
     assert content["policy"]["data"]["control_hz"] == 25.0
     command = ["rollout", str(checkpoint), "--episodes", "1"]
@@ -97,21 +93,17 @@ def test_what_a_test_executes_of_each_chunk_fits_the_checkpoint(
     assert [call["execution"] for call in world] == ["aggregate", executed]
 
 
-def test_results_say_which_budget_was_chosen_and_a_test_that_goes_on_keeps_budgets_apart(
-    world, tiny_act, untrained, tmp_path
-):
-    checkpoint = untrained(tiny_act(), tmp_path)
+def test_results_say_which_budget_was_chosen_and_a_test_that_goes_on_keeps_budgets_apart(world, checkpoint):
     command = ["test", str(checkpoint), "--episodes", "2", "--executions", "[aggregate]", "--resume"]
     for more in ([], ["--refine_ratio", "0"], ["--refine_ratio", "0.5"], ["--refine_ratio", "0.5"]):
         assert main([*command, *more]) == 0
     assert len(world) == 3, "the last had nothing left to do"
-    written = read_results(tmp_path / "evaluation.jsonl")
+    written = read_results(checkpoint.with_name("evaluation.jsonl"))
     assert [item.refine_ratio for item in written] == [None, None, 0.0, 0.0, 0.5, 0.5]
     assert len({item.policy for item in written}) == 3
 
 
-def test_the_policy_computes_where_it_is_asked_to(world, tiny_act, untrained, tmp_path, monkeypatch, capsys):
-    checkpoint = untrained(tiny_act(), tmp_path)
+def test_the_policy_computes_where_it_is_asked_to(world, checkpoint, monkeypatch, capsys):
     moved, real = [], torch.nn.Module.to
     monkeypatch.setattr(torch.nn.Module, "to", lambda self, place: moved.append(place) or real(self, place))
     for choice in ("auto", "cpu"):
@@ -166,9 +158,9 @@ def test_rollout_hands_the_setting_on_and_clean_is_the_default(world):
 
 @pytest.mark.parametrize("command", ["rollout --seeds evaluation", "test --executions [5]"])
 def test_shards_share_a_file_and_one_that_is_started_again_doubles_nothing(
-    world, tiny_act, untrained, tmp_path, capsys, command
+    world, checkpoint, tmp_path, capsys, command
 ):
-    checkpoint, whole = untrained(tiny_act(), tmp_path), tmp_path / "whole.jsonl"
+    whole = tmp_path / "whole.jsonl"
     name, *options = command.split()
     words = [name, str(checkpoint), *options, "--episodes", "7", "--out"]
     assert main([*words, str(whole)]) == 0

@@ -13,9 +13,8 @@ from ugr_lightning.system.lock import locked
 
 
 @pytest.fixture
-def command(world, tiny_act, untrained, tmp_path, ten_demonstrations):
+def command(world, checkpoint, ten_demonstrations):
     """The command line for an ACT of ten steps that learned nothing, on ten seeds."""
-    checkpoint = untrained(tiny_act(), tmp_path)
     return f"sweep {checkpoint} --data {ten_demonstrations} --episodes 10 --ratios [0.5,1]".split()
 
 
@@ -85,9 +84,7 @@ def test_shards_of_a_sweep_run_side_by_side_and_the_whole_writes_the_tables(comm
         assert (folder / page).read_text() == (tmp_path / "whole" / page).read_text()
 
 
-def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(
-    world, tiny_act, untrained, tmp_path, ten_demonstrations, capsys
-):
+def test_a_policy_that_ranks_no_steps_is_swept_over_executions_alone(world, tiny_act, untrained, tmp_path, capsys):
     checkpoint = untrained(tiny_act(None), tmp_path)
     command = ["sweep", str(checkpoint), "--episodes", "2"]
     assert main(command) == 2

@@ -10,10 +10,10 @@ import numpy as np
 from deployed import save
 from fake_policy import Reacher
 from fake_simulator import HOME
-from malformed_frames import malformed
+from malformed_frames import refused
 from trial import Command, Piece, chance
 from websockets.sync.client import connect
-from xpolicylab_client import AugustClient, Client, decode, observation
+from xpolicylab_client import AugustClient, Client, observation
 
 MALFORMED, PROPER, WARM = 10_000, 3_000, 500
 GROWTH_MB = 20
@@ -27,21 +27,6 @@ def _seen(step: int) -> dict[str, object]:
 
 def _memory_mb(pid: int | None) -> float:
     return int(Path(f"/proc/{pid}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 2**20
-
-
-def _refused(url: str, count: int, rng: np.random.Generator, trap: Path) -> int:
-    done = 0
-    with connect(url, compression=None) as connection:
-        while done < count:
-            frames = list(malformed(rng, trap, _seen(0)))
-            for frame in frames:
-                connection.send(frame)
-            for frame in frames:
-                reply = decode(connection.recv(timeout=60))
-                assert reply["message_type"] == "error", frame[:200]
-                assert "Traceback" not in reply["payload"]["message"]
-            done += len(frames)
-    return done
 
 
 def _answered(client: Client, count: int) -> None:
@@ -64,8 +49,10 @@ def soak(folder: Path, number: int) -> str:
         clients = [Client(url, "july"), AugustClient(url, "august")]
         for client in clients:
             _answered(client, WARM // 2)
-        refused, warm = _refused(url, WARM, rng, trap), _memory_mb(pid)
-        refused += _refused(url, MALFORMED - refused, rng, trap)
+        with connect(url, compression=None) as connection:
+            count = refused(connection, WARM, rng, trap, _seen(0))
+            warm = _memory_mb(pid)
+            count += refused(connection, MALFORMED - count, rng, trap, _seen(0))
         for client in clients:
             _answered(client, PROPER // 2)
             client.close()
@@ -75,7 +62,7 @@ def soak(folder: Path, number: int) -> str:
     command.end(128 + signal.SIGTERM)
     assert not trap.exists(), "code from the peer has run"
     assert grown < GROWTH_MB, f"{grown:.1f} MB more"
-    return f"{refused} refused, {PROPER + WARM} answered, {grown:+.1f} MB of {warm:.0f}"
+    return f"{count} refused, {PROPER + WARM} answered, {grown:+.1f} MB of {warm:.0f}"
 
 
 PIECES = [

@@ -18,6 +18,11 @@ from ugr_lightning.results.results import (
 )
 
 
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "r.jsonl"
+
+
 def test_wilson_interval_equals_scipy():
     for n in (1, 2, 10, 37, 100):
         for successes in range(n + 1):
@@ -42,25 +47,17 @@ def test_results_survive_the_file(tmp_path):
     assert read_results(tmp_path / "deep" / "r.jsonl") == written
 
 
-def test_files_from_before_there_were_budgets_are_still_read(tmp_path):
-    path = tmp_path / "r.jsonl"
-    old = result().to_dict()
-    del old["refine_ratio"]
-    path.write_text(json.dumps(old) + "\n")
-    append_result(path, result(1, refine_ratio=0.5))
-    assert [item.refine_ratio for item in read_results(path)] == [None, 0.5]
+NEW = {"budgets": {"refine_ratio": 0.5}, "an alarm": {"disagreement": 0.5, "alarm": 3, "alarm_rate": 0.1}}
 
 
-def test_files_from_before_there_was_an_alarm_are_still_read(tmp_path):
-    path = tmp_path / "r.jsonl"
-    new = ("disagreement", "alarm", "alarm_rate")
+@pytest.mark.parametrize("new", NEW.values(), ids=NEW)
+def test_files_from_before_there_was_something_are_still_read(path, new):
     path.write_text(json.dumps({name: value for name, value in result().to_dict().items() if name not in new}) + "\n")
-    append_result(path, result(1, disagreement=0.5, alarm=3, alarm_rate=0.1))
-    assert [item.alarm for item in read_results(path)] == [None, 3]
+    append_result(path, result(1, **new))
+    assert read_results(path) == [result(), result(1, **new)]
 
 
-def test_a_line_cut_off_by_a_crash_goes_with_the_next_one_of_whoever_shares_the_file(tmp_path):
-    path = tmp_path / "r.jsonl"
+def test_a_line_cut_off_by_a_crash_goes_with_the_next_one_of_whoever_shares_the_file(path):
     append_result(path, result(0))
     path.write_bytes(path.read_bytes() + b'{"task": "t", "se')
     append_result(path, result(1))
@@ -68,8 +65,7 @@ def test_a_line_cut_off_by_a_crash_goes_with_the_next_one_of_whoever_shares_the_
 
 
 @pytest.mark.parametrize("change", [drop_cut_off_line, lambda path: append_result(path, result(2))])
-def test_a_whole_line_that_lacks_only_its_end_is_kept(tmp_path, change):
-    path = tmp_path / "r.jsonl"
+def test_a_whole_line_that_lacks_only_its_end_is_kept(path, change):
     append_result(path, result(0))
     path.write_text(path.read_text() + json.dumps(result(1).to_dict()))
     change(path)
@@ -78,8 +74,7 @@ def test_a_whole_line_that_lacks_only_its_end_is_kept(tmp_path, change):
 
 
 @pytest.mark.parametrize("change", [drop_cut_off_line, lambda path: append_result(path, result(1))])
-def test_two_that_write_one_file_take_turns(tmp_path, change):
-    path = tmp_path / "r.jsonl"
+def test_two_that_write_one_file_take_turns(path, change):
     append_result(path, result(0))
     with path.open("ab") as other:
         fcntl.flock(other, fcntl.LOCK_EX)
@@ -95,8 +90,7 @@ def test_two_that_write_one_file_take_turns(tmp_path, change):
 
 
 @pytest.mark.parametrize("line", ["[1]", '{"task": "t"}', '{"tusk": "t"}', "{"])
-def test_a_broken_line_is_named(tmp_path, line):
-    path = tmp_path / "r.jsonl"
+def test_a_broken_line_is_named(path, line):
     append_result(path, result())
     path.write_text(path.read_text() + line + "\n")
     with pytest.raises(DataError, match="line 2"):
@@ -116,8 +110,7 @@ def test_a_broken_line_is_named(tmp_path, line):
         ("seconds", {"query": "long"}, "an object with values that are a number"),
     ],
 )
-def test_a_value_of_another_kind_is_named_and_not_counted(tmp_path, key, value, wanted):
-    path = tmp_path / "r.jsonl"
+def test_a_value_of_another_kind_is_named_and_not_counted(path, key, value, wanted):
     path.write_text(json.dumps(result().to_dict() | {"refine_ratio": 1}) + "\n")
     assert len(read_results(path)) == 1
     path.write_text(json.dumps(result().to_dict() | {key: value}) + "\n")

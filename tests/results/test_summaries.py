@@ -21,6 +21,13 @@ def evaluations():
     return [Evaluation("ACT", 0, Path("a"), mixed), Evaluation("ACT", 1, Path("c"), [episode(3, "25", True)]), named]
 
 
+@pytest.fixture
+def path(evaluations, tmp_path):
+    """The summary of these evaluations."""
+    write_summary(evaluations, tmp_path / "summary.jsonl")
+    return tmp_path / "summary.jsonl"
+
+
 def facts(found):
     kept = ("task", "setting", "policy", "checkpoint", "seeds_hash", "seed", "success", "steps")
     return {
@@ -36,9 +43,8 @@ def facts(found):
     }
 
 
-def test_what_comparisons_need_survives_the_file(evaluations, tmp_path):
-    write_summary(evaluations, tmp_path / "summary.jsonl")
-    again = read_evaluations(tmp_path)
+def test_what_comparisons_need_survives_the_file(evaluations, path):
+    again = read_evaluations(path.parent)
     assert facts(again) == facts(evaluations)
     assert [summarize(item.results) for item in again] == [summarize(item.results) for item in evaluations]
 
@@ -70,18 +76,14 @@ def test_an_episode_of_the_table_takes_a_few_bytes(tmp_path):
         {"checkpoint": 7},
     ],
 )
-def test_a_line_that_is_no_summary_is_named(change, tmp_path, evaluations):
-    path = tmp_path / "summary.jsonl"
-    write_summary(evaluations, path)
+def test_a_line_that_is_no_summary_is_named(change, path):
     first, second, *others = path.read_text().splitlines()
     path.write_text("\n".join([first, json.dumps(json.loads(second) | change), *others]))
     with pytest.raises(DataError, match=r"summary.jsonl, line 2"):
         read_summary(path)
 
 
-def test_a_broken_line_is_named(tmp_path, evaluations):
-    path = tmp_path / "summary.jsonl"
-    write_summary(evaluations, path)
+def test_a_broken_line_is_named(path):
     path.write_text(path.read_text()[:-40])
     with pytest.raises(DataError, match="line 4"):
         read_summary(path)
@@ -93,9 +95,7 @@ def test_files_of_unknown_training_seeds_stay_apart(tmp_path):
     assert [len(item.results) for item in read_summary(tmp_path / "summary.jsonl")] == [1, 1]
 
 
-def test_nothing_counts_twice(tmp_path, evaluations):
-    path = tmp_path / "summary.jsonl"
-    write_summary(evaluations, path)
+def test_nothing_counts_twice(path):
     path.write_text(path.read_text() + path.read_text().splitlines()[0])
     with pytest.raises(DataError, match="line 5"):
         read_summary(path)

@@ -5,17 +5,11 @@ from fake_simulator import HOME
 
 from ugr_lightning.contract import Chunk, ChunkPolicy, Observation, Statistics
 from ugr_lightning.models.act import ACT
-from ugr_lightning.models.checkpoint import describe
+from ugr_lightning.models.checkpoint import save_policy
 from ugr_lightning.models.keyframes import KeyframeSettings
 
 TINY = {"dim": 16, "feedforward": 32, "heads": 2, "encoder_layers": 1, "decoder_layers": 1, "cvae_layers": 0}
 TINY |= {"backbone_width": 8, "backbone_norm": "batch", "precision": "fp32", "chunk_length": 10, "latent_dim": 4}
-
-
-class Data:
-    """What a checkpoint says about its data."""
-
-    task, setting, state, image_size = "click_alarmclock", "demo_clean", "commanded", (30, 40)
 
 
 class Recaller(ChunkPolicy):
@@ -60,8 +54,6 @@ def looking_act(**changes) -> ACT:
 
 def save(policy: ChunkPolicy, path, **data):
     """Write what `ugr fit` would have written."""
-    about = type("Data", (Data,), data)()
-    weights = {f"policy.{name}": value for name, value in policy.state_dict().items()}
-    path.parent.mkdir(parents=True, exist_ok=True)
-    torch.save({"policy": describe(policy, about), "state_dict": weights, "global_step": 1, "epoch": 0}, path)
+    about = {"task": "click_alarmclock", "setting": "demo_clean", "state": "commanded", "image_size": (30, 40)}
+    save_policy(path, policy, about | data)
     return path

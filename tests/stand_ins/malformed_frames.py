@@ -5,7 +5,7 @@ import pickle
 
 import msgpack
 import numpy as np
-from xpolicylab_client import encode, request
+from xpolicylab_client import decode, encode, request
 
 PARTS = (("arm", 6), ("ee", 1))
 
@@ -83,3 +83,22 @@ def malformed(rng, trap, seen):
     yield infer(env_idx=-1)
     yield infer(env_idx="two")
     yield infer(env_idx=[0])
+
+
+def refused(connection, count, rng, trap, seen):
+    """Send this many frames of `malformed`, or a few more; each gets an error that tells nothing of the inside."""
+    done = 0
+    while done < count:
+        frames = list(malformed(rng, trap, seen))
+        for frame in frames:
+            connection.send(frame)
+        for frame in frames:
+            reply = decode(connection.recv(timeout=60))
+            assert reply["message_type"] == "error", frame[:200]
+            code, message = reply["payload"]["code"], reply["payload"]["message"]
+            assert code in ("invalid_frame", "unknown_message_type", "infer_failed", "call_failed")
+            assert "Traceback" not in message
+            assert "File " not in message
+            assert len(message) <= 1000
+        done += len(frames)
+    return done

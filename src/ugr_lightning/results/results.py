@@ -75,13 +75,12 @@ class EpisodeResult:
         return asdict(self)
 
 
-def wilson_interval(successes: int, n: int, z: float = Z_95) -> tuple[float, float]:
-    """Wilson score interval of a success rate.
+def wilson_interval(successes: int, n: int) -> tuple[float, float]:
+    """95 % Wilson score interval of a success rate.
 
     Args:
         successes: number of successes.
         n: number of trials.
-        z: normal quantile; the default gives 95 %.
 
     Returns:
         lower and upper bound in 0 .. 1; (0, 1) when nothing has been tried.
@@ -93,7 +92,8 @@ def wilson_interval(successes: int, n: int, z: float = Z_95) -> tuple[float, flo
         raise ValueError(f"{successes} successes of {n}")
     if n == 0:
         return 0.0, 1.0
-    rate, denominator = successes / n, 1.0 + z * z / n
+    z, rate = Z_95, successes / n
+    denominator = 1.0 + z * z / n
     centre = (rate + z * z / (2 * n)) / denominator
     half = z / denominator * math.sqrt(rate * (1 - rate) / n + z * z / (4 * n * n))
     # the ends are exact at 0 and n, where rounding would leave 1e-17

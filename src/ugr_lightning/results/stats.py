@@ -7,7 +7,7 @@ from typing import NamedTuple
 from scipy.stats import binomtest
 
 from ugr_lightning.errors import DataError
-from ugr_lightning.results.results import Z_95, EpisodeResult, wilson_interval
+from ugr_lightning.results.results import EpisodeResult, wilson_interval
 
 
 class PairedTable(NamedTuple):
@@ -102,12 +102,11 @@ def mcnemar(only_a: int, only_b: int) -> float:
     return float(binomtest(only_a, only_a + only_b, 0.5).pvalue)
 
 
-def paired_difference_interval(table: PairedTable, z: float = Z_95) -> tuple[float, float]:
-    """Interval of the difference of two success rates on the same seeds.
+def paired_difference_interval(table: PairedTable) -> tuple[float, float]:
+    """95 % interval of the difference of two success rates on the same seeds.
 
     Args:
         table: the paired outcomes.
-        z: normal quantile; the default gives 95 %.
 
     Returns:
         Lower and upper bound of rate a minus rate b, in -1 .. 1; (-1, 1) when nothing has been tried.
@@ -119,7 +118,7 @@ def paired_difference_interval(table: PairedTable, z: float = Z_95) -> tuple[flo
         return -1.0, 1.0
     a, b = table.both + table.only_a, table.both + table.only_b
     rate_a, rate_b = a / table.n, b / table.n
-    (low_a, high_a), (low_b, high_b) = wilson_interval(a, table.n, z), wilson_interval(b, table.n, z)
+    (low_a, high_a), (low_b, high_b) = wilson_interval(a, table.n), wilson_interval(b, table.n)
     correlation = _correlation(table)
 
     def joined(x: float, y: float) -> float:

@@ -65,7 +65,7 @@ def test_jpegs_marked_as_true_rgb_are_not_swapped(tmp_path):
     assert read_episode(episode_path(tmp_path, 0)).images(0)[0, 12, 16].tolist()[0] > 190
 
 
-def test_tool_poses_are_those_without_noise_where_a_file_tells_them(tmp_path, arrays):
+def test_tool_poses_are_those_without_noise_where_a_file_tells_them(tmp_path):
     given = arrays()
     write_episode(tmp_path / "plain.hdf5", **given)
     np.testing.assert_allclose(read_episode(tmp_path / "plain.hdf5").endpose, given["endpose"], rtol=1e-6)

@@ -25,6 +25,12 @@ def _folder(root):
     return root / "click_alarmclock" / "demo_clean"
 
 
+@pytest.fixture
+def folder(tmp_path):
+    """Two episodes."""
+    return record(tmp_path, count=2)
+
+
 @pytest.mark.parametrize("image_size", [None, (12, 16), (7, 32)])
 def test_ram_memmap_and_no_cache_give_the_same_pictures(image_size, tmp_path):
     episodes = _episodes(record(tmp_path, count=3))
@@ -60,8 +66,7 @@ def test_shrinking_averages_areas(recording_root):
     assert np.abs(small - blocks).max() <= 1  # rounded once per direction
 
 
-def test_a_memmap_is_decoded_once_and_again_when_an_episode_changes(tmp_path, monkeypatch):
-    folder = record(tmp_path, count=2)
+def test_a_memmap_is_decoded_once_and_again_when_an_episode_changes(folder, monkeypatch):
     decoded = []
     original = cache_module._decode_all
     monkeypatch.setattr(cache_module, "_decode_all", lambda *a: (decoded.append(1), original(*a)))
@@ -92,8 +97,8 @@ def _open_slowly(folder, log):
         np.testing.assert_array_equal(store.take(np.array([step]))[0], _episodes(folder)[0].images(step))
 
 
-def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decodes(tmp_path):
-    folder, log = record(tmp_path, count=2), tmp_path / "log"
+def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decodes(folder, tmp_path):
+    log = tmp_path / "log"
     processes = [get_context("fork").Process(target=_open_slowly, args=(folder, log)) for _ in range(3)]
     for process in processes:
         process.start()
@@ -103,8 +108,7 @@ def test_processes_that_want_the_same_memmap_at_once_wait_for_the_one_that_decod
     assert log.read_text() == "decoded\n"
 
 
-def test_what_a_killed_process_left_of_a_memmap_is_removed(tmp_path):
-    folder = record(tmp_path, count=2)
+def test_what_a_killed_process_left_of_a_memmap_is_removed(folder):
     open_frames(_episodes(folder), "memmap")
     (path,) = (folder / ".cache").glob("*.npy")
     path.rename(path.with_name(f"{path.name}.1.partial"))
@@ -112,9 +116,7 @@ def test_what_a_killed_process_left_of_a_memmap_is_removed(tmp_path):
     assert list((folder / ".cache").glob("frames-*-*")) == [path]
 
 
-def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, monkeypatch):
-    folder = record(tmp_path, count=2)
-
+def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(folder, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -126,8 +128,7 @@ def test_an_interrupted_memmap_is_not_taken_for_a_whole_one(tmp_path, monkeypatc
     np.testing.assert_array_equal(store.take(np.array([1]))[0], _episodes(folder)[0].images(1))
 
 
-def test_a_damaged_memmap_names_the_file_and_says_what_to_do(tmp_path):
-    folder = record(tmp_path, count=2)
+def test_a_damaged_memmap_names_the_file_and_says_what_to_do(folder):
     open_frames(_episodes(folder), "memmap")
     (path,) = (folder / ".cache").glob("*.npy")
     for content in (b"", b"junk" * 100, path.read_bytes()[:-1]):
@@ -137,16 +138,15 @@ def test_a_damaged_memmap_names_the_file_and_says_what_to_do(tmp_path):
 
 
 @pytest.mark.parametrize("cache", ["ram", "memmap", "none"])
-def test_stores_travel_to_other_processes(cache, tmp_path):
-    store = open_frames(_episodes(record(tmp_path, count=2)), cache)
+def test_stores_travel_to_other_processes(cache, folder):
+    store = open_frames(_episodes(folder), cache)
     packed = pickle.dumps(store)
     if cache == "memmap":
         assert len(packed) < 1000  # the path, not the pictures
     np.testing.assert_array_equal(pickle.loads(packed).take(np.array([9])), store.take(np.array([9])))
 
 
-def test_episodes_of_different_sizes_are_refused(tmp_path):
-    folder = record(tmp_path, count=2)
+def test_episodes_of_different_sizes_are_refused(folder):
     write_episode(episode_path(folder, 1), **arrays(size=(16, 16)))
     with pytest.raises(DataError, match="one image size"):
         open_frames(_episodes(folder), "ram")
