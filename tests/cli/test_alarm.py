@@ -9,8 +9,9 @@ from ugr_lightning.results.results import append_result
 
 
 @pytest.fixture
-def rolled_out(checkpoint, tmp_path):
+def rolled_out(tiny_act, untrained, tmp_path):
     """A checkpoint, and a results file with 24 successes and 6 failures of it in each of two executions."""
+    checkpoint = untrained(tiny_act(chunk_length=50), tmp_path)
     out = tmp_path / "selection.jsonl"
     for execution in ("25", "aggregate"):
         for seed in range(30):
