@@ -89,9 +89,13 @@ def test_converting_writes_says_what_was_lost_and_goes_on(folder, capsys):
         (["data", "inspect", ".", "--episodes", "0"], "at least 1"),
         (["data", "convert", "{folder}", "out"], "to"),
         (["data", "convert", "{folder}", "out", "--to", "xpolicylab"], "robotwin, got xpolicylab"),
-        (["data", "convert", "{folder}", "out", "--to", "act", "--rate", "0"], "--rate: expected a number above 0"),
+        (
+            ["data", "convert", "{folder}", "out", "--to", "act", "--rate", "0"],
+            "--rate: expected a number of steps",
+        ),
         (["data", "convert", "{folder}", "out", "--to", "act", "--cameras", '["top"]'], "top"),
         (["data", "convert", "{folder}", "{folder}", "--to", "act"], "another folder than the source"),
+        (["data", "convert", "{folder}", "out", "--to", "lerobot", "--rate", "1e300"], "no more than 1e5, got 1e+300"),
         (["data", "convert", "{folder}", "out", "act"], "Write `--NAME act`"),
         (
             ["data", "inspect", "{folder}", "--layout.state", "0"],

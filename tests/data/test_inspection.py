@@ -60,6 +60,7 @@ def test_nothing_is_odd_about_good_demonstrations(make):
 
 def test_pictures_show_the_next_keyframes_and_what_is_not_in_them(make):
     poses = np.zeros((STEPS + 1, 2, 7))
+    poses[..., 3] = 1
     poses[..., :3] = [[-0.2, 0, 0], [0.2, 0, -2]]  # the right tool is behind the camera
     parameters = arrays()["camera_parameters"]
     upwards = np.eye(3, 4) + np.array([[0, 0, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1]])  # from 1 m below the table

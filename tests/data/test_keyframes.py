@@ -1,8 +1,11 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ugr_lightning.data.keyframes import first_axes, keyframe_labels, next_keyframes
+from ugr_lightning.data.formats.robotwin import read_episode
+from ugr_lightning.data.keyframes import first_axes, keyframe_labels, missing_for_keyframes, next_keyframes
 
 
 def test_a_keyframe_is_where_the_gripper_changes_while_the_hand_rests_or_the_end():
@@ -21,8 +24,6 @@ def test_axes_are_the_columns_of_the_rotation():
 
 
 def test_labels_are_the_poses_at_the_next_keyframes(episode_file):
-    from ugr_lightning.data.formats.robotwin import read_episode
-
     episode = read_episode(episode_file)
     position, axes, delay = keyframe_labels(episode)
     assert (position.shape, axes.shape, delay.shape) == ((12, 2, 3), (12, 2, 6), (12, 2))
@@ -34,8 +35,16 @@ def test_labels_are_the_poses_at_the_next_keyframes(episode_file):
 
 @pytest.mark.parametrize("missing", ["endpose", "projection"])
 def test_a_demonstration_without_poses_or_calibration_has_no_labels(episode_file, missing):
-    from dataclasses import replace
-
-    from ugr_lightning.data.formats.robotwin import read_episode
-
     assert keyframe_labels(replace(read_episode(episode_file), **{missing: None})) is None
+
+
+@pytest.mark.parametrize("unfilled", ["endpose", "projection"])
+def test_poses_and_calibration_that_nobody_filled_in_are_missing(episode_file, unfilled):
+    episode = read_episode(episode_file)
+    assert missing_for_keyframes(episode) == []
+    values = getattr(episode, unfilled).copy()
+    values[3] = 0
+    changed = replace(episode, **{unfilled: values})
+    (said,) = missing_for_keyframes(changed)
+    assert "filled in" in said
+    assert keyframe_labels(changed) is None

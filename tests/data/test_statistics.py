@@ -38,6 +38,13 @@ def test_measured_statistics_are_those_of_the_measured_joints(recording_root):
     np.testing.assert_array_equal(got.numpy(), rows.mean(0).astype(np.float32))
 
 
+def test_keyframes_have_statistics_where_every_episode_has_them_also_those_that_validate(recording_root):
+    episodes = _episodes(recording_root)
+    assert compute_statistics(episodes, [0, 2]).keyframe_mean is not None
+    without = [episodes[0], replace(episodes[1], endpose=None), episodes[2]]
+    assert compute_statistics(without, [0, 2]).keyframe_mean is None
+
+
 def test_a_joint_that_never_moves_gets_the_smallest_deviation(recording_root):
     episode: Episode = _episodes(recording_root)[0]
     still = replace(episode, state=np.full_like(episode.state, 0.3))

@@ -234,8 +234,8 @@ def convert_data(
     from ugr_lightning.data.selection import Selection
     from ugr_lightning.system.progress import Progress
 
-    if rate is not None and not rate >= 1e-3:
-        raise ConfigError("--rate", "a number above 0", rate, "Correct the number.")
+    if rate is not None and not 1e-3 <= rate <= 1e5:
+        raise ConfigError("--rate", "a number of steps per second above 0, and no more than 1e5", rate, "Correct it.")
     with ExitStack() as stack:
         bars: dict[str, Progress] = {}
 

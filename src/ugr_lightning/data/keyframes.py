@@ -11,6 +11,9 @@ AT_REST = 0.002
 """An arm whose joints are commanded to move less in a control step, rad, is to rest: a gripper that closes on the way
 marks no keyframe, and noise on the executed motion hides none."""
 
+FLAT = 1e-6
+"""Determinant of a camera's matrix below which it sees no depth; a real one has one of about 1."""
+
 
 def next_keyframes(commands: np.ndarray) -> np.ndarray:
     """For each step of a demonstration, when the next keyframe of an arm is.
@@ -35,9 +38,14 @@ def missing_for_keyframes(episode: Episode) -> list[str]:
         episode: of any format.
     """
     commands = f"commands of two arms of six joints ({ACTION_DIM} numbers; {episode.action.shape[1]} here)"
+    poses, cameras = episode.endpose, episode.projection  # (T + 1, 2, 7), (T, V, 3, 4)
+    lengths = np.ones(1) if poses is None else np.linalg.norm(poses[..., 3:], axis=-1)  # (T + 1, 2), of quaternions
+    depths = np.ones(1) if cameras is None else np.linalg.det(cameras[..., :3].astype(np.float64))  # (T, V)
     lacks = {
-        "tool poses (`endpose`)": episode.endpose is None,
-        "calibrated cameras (`intrinsic_cv`, `extrinsic_cv`)": episode.projection is None,
+        "tool poses (`endpose`)": poses is None,
+        "tool poses that are filled in (`endpose` has quaternions of length 0)": not lengths.all(),
+        "calibrated cameras (`intrinsic_cv`, `extrinsic_cv`)": cameras is None,
+        "a calibration that is filled in (`intrinsic_cv`, `extrinsic_cv` have no inverse)": np.abs(depths).min() < FLAT,
         commands: episode.action.shape[1] != ACTION_DIM,
     }
     return [what for what, missing in lacks.items() if missing]

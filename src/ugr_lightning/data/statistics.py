@@ -7,7 +7,7 @@ import torch
 
 from ugr_lightning.contract import Statistics
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.keyframes import keyframe_labels
+from ugr_lightning.data.keyframes import keyframe_labels, missing_for_keyframes
 from ugr_lightning.errors import DataError
 
 MIN_STD = 1e-2  # an arm that never moves would otherwise be blown up by normalisation
@@ -39,7 +39,7 @@ def compute_statistics(
     actions = np.concatenate([episode.action for episode in chosen]).astype(np.float64)  # (N, A)
     labels = [keyframe_labels(episode) for episode in chosen]
     positions = [label[0] for label in labels if label is not None]  # of (T, 2, 3)
-    if len(positions) < len(chosen):
+    if any(map(missing_for_keyframes, episodes)):  # validation needs them, too
         return Statistics(*_moments(states), *_moments(actions))
     mean, std, *_ = _moments(np.concatenate(positions).astype(np.float64))  # (2, 3) each
     whole = Statistics(*_moments(states), *_moments(actions))

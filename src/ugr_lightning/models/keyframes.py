@@ -94,7 +94,7 @@ class KeyframeFinder(nn.Module):
             ConfigError: the data have no keyframes.
         """
         if statistics.keyframe_mean is None or statistics.keyframe_std is None:
-            raise missing_keyframes("demonstrations without tool poses or without calibrated cameras")
+            raise missing_keyframes("demonstrations of which some or all lack them (`ugr data inspect` says what)")
         self.centre.copy_(statistics.keyframe_mean)
         self.spread.copy_(statistics.keyframe_std)
 
