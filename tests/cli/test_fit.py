@@ -233,7 +233,11 @@ def test_an_optimiser_that_divides_the_parameters_in_another_way_cannot_be_gone_
     before = sorted(RUN.parent.iterdir())
     assert main(["fit", "--config", tiny_config, "--checkpoint", "other.ckpt"]) == 2
     said = " ".join(capsys.readouterr().err.split())
-    assert f"other.ckpt: expected an optimiser of {size} parameters, got {size - 1} and 1." in said
+    assert f"other.ckpt: expected an optimiser of {size} parameters, got {size - 1} and 1. It is of another" in said
+    groups[:] = groups[:1]
+    torch.save(content, "other.ckpt")
+    assert main(["fit", "--config", tiny_config, "--checkpoint", "other.ckpt"]) == 2
+    assert "Other parameters are frozen now" in " ".join(capsys.readouterr().err.split())
     assert sorted(RUN.parent.iterdir()) == before
 
 

@@ -1,4 +1,5 @@
 import csv
+import math
 import warnings
 
 import pytest
@@ -137,6 +138,31 @@ def test_the_backbone_and_the_keyframes_maps_learn_at_a_rate_of_their_own():
     parts = {group["lr"]: {names[id(one)].partition(".")[0] for one in group["params"]} for group in groups}
     assert parts[1e-3] == {"backbone", "finder"}
     assert {"encoder", "decoder", "action_head", "input_proj"} <= parts[3e-4]
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"learning_rate": -1.0},
+        {"learning_rate": math.nan},
+        {"learning_rate": math.inf},
+        {"backbone_learning_rate": -1e-3},
+        {"weight_decay": -1.0},
+        {"warmup_steps": -3},
+        {"betas": (0.9, 1.0)},
+        {"betas": (-0.1, 0.9)},
+    ],
+)
+def test_numbers_that_no_training_can_have_are_named(given):
+    with pytest.raises(ConfigError, match=rf"model\.{next(iter(given))}: expected"):
+        PolicyModule(looking_act(), **given)
+
+
+def test_a_policy_of_which_nothing_is_trained_is_refused_in_words():
+    module = PolicyModule(TinyPolicy().requires_grad_(False))
+    module.trainer = Trainer(**QUIET, logger=False, max_steps=1)
+    with pytest.raises(ConfigError, match="none that are not frozen"):
+        module.configure_optimizers()
 
 
 @pytest.mark.parametrize(

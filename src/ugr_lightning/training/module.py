@@ -44,6 +44,9 @@ class PolicyModule(LightningModule):
         schedule: what follows the warm-up: `constant`; `cosine` down to a hundredth at the trainer's last step; or
             `cosine_to_zero`, whose warm-up also begins at zero, as Diffusion Policy's does.
         betas: decay rates of AdamW's two averages.
+
+    Raises:
+        ConfigError: a number that no training can have.
     """
 
     def __init__(
@@ -57,6 +60,14 @@ class PolicyModule(LightningModule):
         betas: tuple[float, float] = (0.9, 0.999),
     ) -> None:
         super().__init__()
+        rates = {"learning_rate": learning_rate, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
+        if backbone_learning_rate is not None:
+            rates["backbone_learning_rate"] = backbone_learning_rate
+        for name, value in rates.items():  # AdamW looks at the rate of its first group only
+            if not 0 <= value < math.inf:
+                raise ConfigError(f"model.{name}", "a number, 0 or more", value, "Correct the number.")
+        if not all(0 <= beta < 1 for beta in betas):
+            raise ConfigError("model.betas", "two numbers from 0 to below 1", betas, "Correct the numbers.")
         self.policy = policy
         self.learning_rate = learning_rate
         self.backbone_learning_rate = learning_rate if backbone_learning_rate is None else backbone_learning_rate
@@ -152,10 +163,17 @@ class PolicyModule(LightningModule):
         return metric
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW with what sees as a group of its own, and a schedule that counts optimiser steps."""
+        """AdamW with what sees as a group of its own, and a schedule that counts optimiser steps.
+
+        Raises:
+            ConfigError: nothing of the policy is trained.
+        """
         rates = (self.learning_rate, self.backbone_learning_rate)
         parts = zip(acting_and_seeing(self.policy), rates, strict=True)
         groups = [{"params": parameters, "lr": rate} for parameters, rate in parts if parameters]
+        if not groups:
+            fix = "Let `requires_grad` of some of them be true."
+            raise ConfigError("model.policy", "parameters that are trained", "none that are not frozen", fix)
         fused = not str(self.trainer.precision).endswith("-mixed")  # Lightning clips no gradients of a fused one then
         optimizer = torch.optim.AdamW(
             groups, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay, fused=fused

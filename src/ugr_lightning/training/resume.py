@@ -60,6 +60,8 @@ def check_training(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> 
     now = [len(part) for part in acting_and_seeing(policy) if part]
     if before != now:
         fix = "It is of another version of this package: go on with that one, or train afresh without --checkpoint."
+        if sum(before) != sum(now):
+            fix = "Other parameters are frozen now: let the same ones learn, or train afresh without --checkpoint."
         raise CheckpointError(path, f"an optimiser of {_counts(now)} parameters", _counts(before), fix)
 
 
