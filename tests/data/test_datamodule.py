@@ -123,7 +123,7 @@ def test_missing_episodes_are_recorded(tmp_path):
 
 def test_missing_episodes_without_a_recorder_say_which_command_to_run(tmp_path):
     record(tmp_path, count=3)
-    with pytest.raises(DataError, match=r"5 demonstrations, got 3.*ugr collect click_alarmclock --episodes 5"):
+    with pytest.raises(DataError, match=r"5 demonstrations, got 3.*ugr collect click_alarmclock --episodes 5 --root /"):
         _data(tmp_path).prepare_data()
 
 

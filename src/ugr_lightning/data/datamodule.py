@@ -1,5 +1,6 @@
 """Demonstrations on disk to batches: recording what is missing, checking, splitting, caching, loading."""
 
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -47,6 +48,7 @@ class Recording:
     workers: int = 2
 
 
+DEFAULT_ROOT = "data/160x120"
 DEFAULT_SAMPLING = Sampling()
 DEFAULT_RECORDING = Recording()
 
@@ -92,7 +94,7 @@ class ChunkDataModule(lightning.LightningDataModule):
     def __init__(
         self,
         task: str = "click_alarmclock",
-        root: str = "data/160x120",
+        root: str = DEFAULT_ROOT,
         setting: str = "demo_clean",
         episodes: int | tuple[int, ...] = 50,
         cameras: tuple[str, ...] = CAMERAS,
@@ -193,12 +195,20 @@ class ChunkDataModule(lightning.LightningDataModule):
         form, found = self._find()
         chosen = self.selection.choose(found, self.folder) if form else {}
         if form is None or len(chosen) < self.wanted:
-            fix = f"Record them with `ugr collect {self.task} --episodes {self.wanted}`."
+            fix = f"Record them with `{self._command()}`, or say where they are."
             if form is not None and (self.elsewhere or form.name != RECORDED):
                 fix = f"Set `data.episodes` to {len(chosen)} or less."
             of_tasks = f" of {', '.join(self.tasks)}" if self.tasks else ""
             raise DataError(self.folder, f"{self.wanted} demonstrations{of_tasks}", len(chosen), fix)
         return form, chosen, len(found)
+
+    def _command(self) -> str:
+        """What records what is missing, into the folder that is read."""
+        words = f"ugr collect {self.task} --episodes {self.wanted}"
+        if self.setting != "demo_clean":
+            words += f" --setting {self.setting}"
+        root = self.folder.parents[1]
+        return words if str(root) == DEFAULT_ROOT else f"{words} --root {shlex.quote(str(root))}"
 
     def positions_of(self, tasks: str | Sequence[str]) -> set[int]:
         """Positions of the demonstrations of some tasks among those that are used; of all, where none is named.
