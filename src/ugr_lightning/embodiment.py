@@ -21,6 +21,15 @@ GRIPPERS = last_of_each_arm(ACTION_DIM)
 """Where the grippers are in both vectors."""
 
 
+# One ViperX 300s arm, from its base to its tool; lengths in m. Its joints turn about z, y, y, x, y and x.
+BASE_X = 0.469  # the arms stand at x = -+BASE_X and face each other, as in ALOHA
+SHOULDER_HEIGHT = 0.12705
+UPPER_ARM = (0.05955, 0.3)  # x and z of the elbow in the upper arm's frame
+FOREARM = 0.3
+TCP_OFFSET = 0.14  # gripper link to TCP, between the finger pads
+TOOL_LENGTH = 0.069744 + TCP_OFFSET  # wrist centre to TCP
+
+
 def image_projection(intrinsic: np.ndarray, extrinsic: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
     """The matrix that takes a point of the world to image units, whatever the size of the picture.
 

@@ -14,6 +14,7 @@ from ugr_lightning.models.act import ACT
 from ugr_lightning.models.checkpoint import load_policy, save_policy
 from ugr_lightning.models.diffusion import DiffusionPolicy
 from ugr_lightning.models.keyframes import KeyframeSettings
+from ugr_lightning.models.refine.full import Full
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.results.results import append_result
 
@@ -80,7 +81,10 @@ def test_keyframes_are_exported_with_the_calibration_as_an_input(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
     sizes = {"backbone_stem": "unshuffle", "backbone_width": 8, "backbone_norm": "batch", "chunk_length": 10}
-    save(ACT(**TINY, **sizes, keyframes=KeyframeSettings(channels=8), decoder_layers=1))
+    looks = {"keyframes": KeyframeSettings(channels=8), "refine": Full(), "refine_branch": "reach"}
+    policy = ACT(**TINY, **sizes, **looks, decoder_layers=1)
+    policy.reach.share[-1].bias.data.fill_(0.5)
+    save(policy)
     assert main(["export", "policy.ckpt", "--to", to, "--out", "folder"]) == 0
     assert "differ by at most" in capsys.readouterr().out
 

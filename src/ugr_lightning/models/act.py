@@ -29,6 +29,7 @@ from ugr_lightning.models.losses import (
 )
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.precision import Precision, autocast, full_precision
+from ugr_lightning.models.reach import Reach, require_arms
 from ugr_lightning.models.refine.branch import BranchName, ResidualBranch
 from ugr_lightning.models.refine.selector import Selector
 from ugr_lightning.models.tokens import TokenPolicy
@@ -45,6 +46,7 @@ class Plan(NamedTuple):
         log_variance: (B, K) float32, s; None without an uncertainty head.
         refined: (B, K) bool, m; None where nothing refines.
         sighting: the hands' next keyframes; None where the policy does not look for them.
+        hidden: (B, K, D) float32, H_0.
     """
 
     actions: Tensor
@@ -52,6 +54,7 @@ class Plan(NamedTuple):
     log_variance: Tensor | None
     refined: Tensor | None
     sighting: Sighting | None
+    hidden: Tensor
 
 
 class ACT(TokenPolicy):
@@ -61,7 +64,8 @@ class ACT(TokenPolicy):
 
     Args:
         refine: which steps are refined: Full, Block, Uncertainty, a selector of your own, or null for none (`base`).
-        refine_branch: what computes the correction: `mlp` per step, or one more `decoder` layer.
+        refine_branch: what computes the correction: `mlp` per step, one more `decoder` layer, or `reach`, per step and
+            towards where the tools' next keyframes are seen.
         refine_detach_coarse: keep the refinement loss from changing the coarse actions; the paper lets it.
         uncertainty_head: predict a log-variance per step even where `refine` does not ask for it, for analysis.
         causal: let a step attend only to earlier ones in the decoder's self-attention (`cmask`).
@@ -108,7 +112,7 @@ class ACT(TokenPolicy):
     """
 
     not_kept: ClassVar[tuple[str, ...]] = ("backbone_weights",)
-    exact: ClassVar[tuple[str, ...]] = ("action_head", "uncertainty_head")
+    exact: ClassVar[tuple[str, ...]] = ("action_head", "uncertainty_head", "reach")
     only_trained: ClassVar[tuple[str, ...]] = ("posterior",)
 
     def __init__(
@@ -199,9 +203,23 @@ class ACT(TokenPolicy):
         self.action_head = nn.Linear(dim, action_dim)
         self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
         self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
+        reaches = refine is not None and refine_branch == "reach"
+        if reaches and keyframes is None:
+            fix = "Add `--config keyframes/act`, or set `refine_branch: mlp`."
+            raise ConfigError("refine_branch: reach", "a policy that looks for keyframes", "`keyframes: null`", fix)
+        self.reach = Reach(dim) if reaches else None
         self.budget = refine.budget(chunk_length) if refine is not None else None
         if backbone_weights is not None:
             self.backbone.load_weights(backbone_weights)
+
+    def check(self, batch: Batch) -> None:
+        """Refuse the demonstrations of other arms to a branch that knows its own.
+
+        Raises:
+            ConfigError: they are of another robot.
+        """
+        if self.reach is not None and batch.keyframes is not None:
+            require_arms(batch)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """The terms of the objective; paper, Eq. (6) to (8).
@@ -213,7 +231,7 @@ class ACT(TokenPolicy):
             batch: observations and the chunks that followed.
 
         Returns:
-            Scalars `loss`, `coarse`, and where the policy has them `refine`, `uncertainty`, `kl`.
+            Scalars `loss`, `coarse`, and where the policy has them `refine`, `uncertainty`, `kl`, `reach`.
 
         Raises:
             ConfigError: images of another number of cameras.
@@ -241,6 +259,10 @@ class ACT(TokenPolicy):
             uncertainty_weight=self.uncertainty_weight,
             kl_weight=self.kl_weight,
         )
+        if self.reach is not None and plan.sighting is not None:
+            robot, points = self.normalizer.robot_action(plan.coarse.detach()), plan.sighting.points[:, :, 0]
+            terms["reach"] = self.reach.lesson(plan.hidden, robot, points, batch.actions, acting)
+            total = total + terms["reach"]
         return self.lesson({"loss": total, **terms}, plan.sighting)
 
     @torch.no_grad()
@@ -297,7 +319,7 @@ class ACT(TokenPolicy):
             if self.uncertainty_head is not None:
                 log_variance = self.uncertainty_head(whole.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
         if self.refine is None or self.branch is None:
-            return Plan(coarse, coarse, log_variance, None, sighting)
+            return Plan(coarse, coarse, log_variance, None, sighting, whole)
         hint = None if log_variance is None else log_variance.detach()
         refined = self.refine.select(hint, valid, self.training)  # (B, K), m
         start = coarse.detach() if self.refine_detach_coarse else coarse
@@ -306,8 +328,13 @@ class ACT(TokenPolicy):
                 residual = self.branch.at(refined, self.budget, hidden, start)  # (B, K, A), m * dA
             else:
                 residual = self.branch(hidden, start, self.query_embed, memory, memory_keys)  # (B, K, A), dA
+        if self.reach is not None and sighting is not None:
+            with full_precision(state.device):
+                robot, points = self.normalizer.robot_action(start), sighting.points[:, :, 0]  # (B, K, A), (B, 2, 3)
+                motion = self.reach(whole, robot, points) / self.normalizer.action_scale  # (B, K, A)
+                residual = residual + motion.detach()  # it has a lesson of its own
         actions = start + refined[..., None] * residual  # (B, K, A), A_1 = A_0 + m * dA
-        return Plan(actions, coarse, log_variance, refined, sighting)
+        return Plan(actions, coarse, log_variance, refined, sighting, whole)
 
     def _lessons(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Which steps (B, K) teach the actions, and which the uncertainty; the same, unless episodes are held out."""

@@ -9,17 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ugr_lightning.embodiment import BASE_X, FOREARM, SHOULDER_HEIGHT, TOOL_LENGTH, UPPER_ARM
 from ugr_lightning.errors import SimulationError
 
 Array = NDArray[np.float64]
 
 SIDES: tuple[str, str] = ("left", "right")
-BASE_X = 0.469  # the arms stand at x = -+BASE_X and face each other, as in ALOHA
-SHOULDER_HEIGHT = 0.12705
-UPPER_ARM = (0.05955, 0.3)  # x and z of the elbow in the upper arm's frame
-FOREARM = 0.3
-TCP_OFFSET = 0.14  # gripper link to TCP, between the finger pads
-TOOL_LENGTH = 0.069744 + TCP_OFFSET  # wrist centre to TCP
 JOINT_LOW: Array = np.array([-3.14158, -1.85005, -1.76278, -3.14158, -1.8675, -3.14158])
 JOINT_HIGH: Array = np.array([3.14158, 1.25664, 1.6057, 3.14158, 2.23402, 3.14158])
 FINGER_CLOSED, FINGER_OPEN = 0.0215, 0.057  # finger joint, metres

@@ -2,7 +2,8 @@
 
 from mani_skill.envs.scene import ManiSkillScene
 
-from ugr_lightning.sim.kinematics import BASE_X, rotation_z
+from ugr_lightning.embodiment import BASE_X
+from ugr_lightning.sim.kinematics import rotation_z
 from ugr_lightning.sim.objects import Colour, Prop, pose_of
 from ugr_lightning.sim.settings import TABLE_SIZE, Clutter, Surroundings
 

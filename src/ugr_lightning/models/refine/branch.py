@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from ugr_lightning.models.transformer import DecoderLayer
 
-BranchName = Literal["mlp", "decoder"]
+BranchName = Literal["mlp", "decoder", "reach"]
 
 
 class ResidualBranch(nn.Module):
@@ -16,8 +16,8 @@ class ResidualBranch(nn.Module):
     Its last layer starts at zero, so that training starts at the coarse policy.
 
     Args:
-        kind: `mlp` corrects each step by itself; `decoder` is one more decoder layer with cross-attention to the
-            shared memory.
+        kind: `mlp` corrects each step by itself, also beside `reach`; `decoder` is one more decoder layer with
+            cross-attention to the shared memory.
         dim, heads, feedforward, dropout: sizes of the trunk.
         action_dim: A.
 
@@ -30,7 +30,7 @@ class ResidualBranch(nn.Module):
         super().__init__()
         self.action_proj = nn.Linear(action_dim, dim)
         self.layer = DecoderLayer(dim, heads, feedforward, dropout) if kind == "decoder" else None
-        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU()) if kind == "mlp" else None
+        self.mlp = nn.Sequential(nn.Linear(dim, dim), nn.GELU()) if kind != "decoder" else None
         self.head = nn.Linear(dim, action_dim)
         nn.init.zeros_(self.head.weight)
         nn.init.zeros_(self.head.bias)

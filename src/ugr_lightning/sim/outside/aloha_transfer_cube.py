@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from ugr_lightning.embodiment import TCP_OFFSET
 from ugr_lightning.errors import SimulationError
 from ugr_lightning.sim.expert import Arms, ExpertStep, facing, gripper_level
 from ugr_lightning.sim.frame import Frame
@@ -13,7 +14,6 @@ from ugr_lightning.sim.kinematics import (
     JOINT_HIGH,
     JOINT_LOW,
     SIDES,
-    TCP_OFFSET,
     UP,
     Array,
     TcpPose,
