@@ -1,0 +1,64 @@
+"""`ugr reach` from a checkpoint with keyframes to one that is refined towards them."""
+
+import numpy as np
+import pytest
+import torch
+from deployed import looking_act
+from recordings import record
+from tiny import TinyPolicy
+
+from ugr_lightning.cli.main import main
+from ugr_lightning.embodiment import CAMERAS
+from ugr_lightning.models.checkpoint import load_policy
+from ugr_lightning.models.refine.uncertainty import Uncertainty
+from ugr_lightning.sim.kinematics import HOME, SIDES, forward, to_world
+
+STEPS = 12
+
+
+@pytest.fixture
+def demonstrations(tmp_path):
+    """Root of ten demonstrations whose tools are where the commands take them."""
+    joints = HOME + np.random.default_rng(0).uniform(-0.4, 0.4, (STEPS, 2, 6))
+    commands = np.concatenate([joints, np.full((STEPS, 2, 1), 0.5)], -1).reshape(STEPS, 14)
+    places = [[to_world(side, forward(q)).position for side, q in zip(SIDES, both, strict=True)] for both in joints]
+    tools = np.concatenate([places, np.tile([1.0, 0, 0, 0], (STEPS, 2, 1))], -1)  # (T, 2, 7)
+    shown = {"expert_action": commands.astype(np.float32), "endpose": np.concatenate([tools[:1], tools])}
+    record(tmp_path / "known", 10, STEPS, 0, size=(32, 48), **shown)
+    return tmp_path / "known"
+
+
+def command(tmp_path, root):
+    return ["reach", str(tmp_path / "policy_best.ckpt"), "--data", str(root), "--stride", "3"]
+
+
+def test_a_policy_learns_to_reach_and_keeps_everything_else(demonstrations, untrained, tmp_path, capsys):
+    untrained(looking_act(refine=Uncertainty()), tmp_path, {"root": str(demonstrations)})
+    assert main(command(tmp_path, demonstrations)) == 0
+    assert "before and after" in capsys.readouterr().out
+    before, _ = load_policy(tmp_path / "policy_best.ckpt")
+    after, info = load_policy(tmp_path / "policy_best_reach.ckpt")
+    assert info.data["task"] == "click_alarmclock"
+    kept = before.state_dict()
+    for name, value in after.state_dict().items():
+        if not name.startswith(("reach.", "branch.head.")):
+            assert torch.equal(value, kept[name]), name
+    assert any(part.any() for part in after.reach.share[-1].parameters())
+
+
+def test_the_same_checkpoint_learns_the_same(demonstrations, untrained, tmp_path):
+    untrained(looking_act(), tmp_path, {"root": str(demonstrations)})
+    for out in ("one.ckpt", "two.ckpt"):
+        assert main([*command(tmp_path, demonstrations), "--out", str(tmp_path / out)]) == 0
+    one, two = (load_policy(tmp_path / name)[0].state_dict() for name in ("one.ckpt", "two.ckpt"))
+    assert all(torch.equal(value, two[name]) for name, value in one.items())
+
+
+def test_other_arms_and_other_policies_are_refused(ten_demonstrations, untrained, tmp_path, capsys):
+    untrained(looking_act(), tmp_path)
+    assert main(command(tmp_path, ten_demonstrations)) == 2
+    assert "another robot" in capsys.readouterr().err
+    untrained(TinyPolicy(cameras=CAMERAS, dim=14), tmp_path)
+    assert main(command(tmp_path, ten_demonstrations)) == 2
+    assert "class ACT" in capsys.readouterr().err
+    assert not (tmp_path / "policy_best_reach.ckpt").exists()
