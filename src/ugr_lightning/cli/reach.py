@@ -53,7 +53,7 @@ def _reach(
         before.append(event_errors(forward, chunk.coarse, batch))
         after.append(event_errors(forward, chunk.actions, batch))
     path = Path(out) if out else file.with_name(f"{file.stem}_reach.ckpt")
-    save_policy(path, reaching, info.data)
+    save_policy(path, reaching, dict(info.data))
     if len(torch.cat(before)):
         off = " and ".join(f"{torch.cat(errors).median():.1f}" for errors in (before, after))
         print(f"tools at keyframes of validation episodes, before and after: {off} mm off (medians)")
