@@ -33,7 +33,9 @@ def command(tmp_path, root):
 
 
 def test_a_policy_learns_to_reach_and_keeps_everything_else(demonstrations, untrained, tmp_path, capsys):
-    untrained(looking_act(refine=Uncertainty()), tmp_path, {"root": str(demonstrations)})
+    policy = looking_act(refine=Uncertainty())
+    torch.nn.init.normal_(policy.branch.head.weight)  # it had learned to refine in another way
+    untrained(policy, tmp_path, {"root": str(demonstrations)})
     assert main(command(tmp_path, demonstrations)) == 0
     assert "before and after" in capsys.readouterr().out
     before, _ = load_policy(tmp_path / "policy_best.ckpt")
@@ -43,6 +45,7 @@ def test_a_policy_learns_to_reach_and_keeps_everything_else(demonstrations, untr
     for name, value in after.state_dict().items():
         if not name.startswith(("reach.", "branch.head.")):
             assert torch.equal(value, kept[name]), name
+    assert not any(part.any() for part in after.branch.head.parameters())
     assert any(part.any() for part in after.reach.share[-1].parameters())
 
 
