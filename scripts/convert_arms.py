@@ -14,12 +14,12 @@ import fast_simplification
 import numpy as np
 import trimesh
 
+from ugr_lightning.embodiment import TCP_OFFSET
 from ugr_lightning.sim.kinematics import (
     BASE_X,
     FINGER_CLOSED,
     FINGER_OPEN,
     SIDES,
-    TCP_OFFSET,
     Array,
     rotation_x,
     rotation_y,
