@@ -160,6 +160,7 @@ def test_the_backbone_and_the_keyframes_maps_learn_at_a_rate_of_their_own():
         {"learning_rate": math.nan},
         {"learning_rate": math.inf},
         {"backbone_learning_rate": -1e-3},
+        {"muon_learning_rate": -1e-3},
         {"weight_decay": -1.0},
         {"warmup_steps": -3},
         {"betas": (0.9, 1.0)},
@@ -176,6 +177,11 @@ def test_a_policy_of_which_nothing_is_trained_is_refused_in_words():
     module.trainer = Trainer(**QUIET, logger=False, max_steps=1)
     with pytest.raises(ConfigError, match="none that are not frozen"):
         module.configure_optimizers()
+
+
+def test_a_policy_without_transformer_layers_has_nothing_for_muon_and_is_refused_in_words():
+    with pytest.raises(ConfigError, match=r"muon_learning_rate: expected a policy with transformer layers.*TinyPolicy"):
+        PolicyModule(TinyPolicy(), muon_learning_rate=1e-3).parts()
 
 
 @pytest.mark.parametrize(

@@ -248,7 +248,7 @@ class UGRCLI(LightningCLI):
         if content is None or not _is_first_process():
             return
         path = Path(self._get(self.config, "checkpoint"))
-        check_training(path, content, self.model.policy)
+        check_training(path, content, self.model.parts())
         self.datamodule.prepare_data()
         self.datamodule.setup("fit")
         check_data(path, content, self.model.policy, self.datamodule)

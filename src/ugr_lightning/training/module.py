@@ -18,18 +18,7 @@ from ugr_lightning.contract import Batch, Chunk, ChunkPolicy, Statistics
 from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.training.keyframe_error import MedianMetric, event_errors, known_kinematics
-
-SEEING = ("backbone", "finder")
-"""Words in the names of the parameters that see: the backbone and the keyframes' maps."""
-
-
-def acting_and_seeing(policy: ChunkPolicy) -> tuple[list[nn.Parameter], list[nn.Parameter]]:
-    """What is trained of a policy: parameters that learn at `learning_rate`, and those at `backbone_learning_rate`."""
-    parts: tuple[list[nn.Parameter], list[nn.Parameter]] = [], []
-    for name, parameter in policy.named_parameters():
-        if parameter.requires_grad:
-            parts[any(word in name for word in SEEING)].append(parameter)
-    return parts
+from ugr_lightning.training.optimizer import MuonAndAdamW, Parts, parts_of
 
 
 class PolicyModule(LightningModule):
@@ -39,6 +28,8 @@ class PolicyModule(LightningModule):
         policy: the policy to train.
         learning_rate: peak step size of AdamW (paper, section IV-A: 1e-5).
         backbone_learning_rate: step size of what sees (backbone, keyframes' maps); null means `learning_rate`.
+        muon_learning_rate: step size of Muon, which trains the matrices of transformer layers then (`learning_rate`
+            times three is a good start); null means AdamW trains them as the rest.
         weight_decay: AdamW's decoupled weight decay.
         warmup_steps: optimiser steps over which the learning rate rises linearly.
         schedule: what follows the warm-up: `constant`; `cosine` down to a hundredth at the trainer's last step; or
@@ -54,6 +45,7 @@ class PolicyModule(LightningModule):
         policy: ChunkPolicy,
         learning_rate: float = 1e-5,
         backbone_learning_rate: float | None = None,
+        muon_learning_rate: float | None = None,
         weight_decay: float = 1e-4,
         warmup_steps: int = 0,
         schedule: Literal["constant", "cosine", "cosine_to_zero"] = "constant",
@@ -61,8 +53,8 @@ class PolicyModule(LightningModule):
     ) -> None:
         super().__init__()
         rates = {"learning_rate": learning_rate, "weight_decay": weight_decay, "warmup_steps": warmup_steps}
-        if backbone_learning_rate is not None:
-            rates["backbone_learning_rate"] = backbone_learning_rate
+        own = {"backbone_learning_rate": backbone_learning_rate, "muon_learning_rate": muon_learning_rate}
+        rates |= {name: value for name, value in own.items() if value is not None}
         for name, value in rates.items():  # AdamW looks at the rate of its first group only
             if not 0 <= value < math.inf:
                 raise ConfigError(f"model.{name}", "a number, 0 or more", value, "Correct the number.")
@@ -71,6 +63,7 @@ class PolicyModule(LightningModule):
         self.policy = policy
         self.learning_rate = learning_rate
         self.backbone_learning_rate = learning_rate if backbone_learning_rate is None else backbone_learning_rate
+        self.muon_learning_rate = muon_learning_rate
         self.weight_decay = weight_decay
         self.warmup_steps = warmup_steps
         self.schedule = schedule
@@ -167,22 +160,38 @@ class PolicyModule(LightningModule):
         assert isinstance(metric, Metric)
         return metric
 
-    def configure_optimizers(self) -> OptimizerLRScheduler:
-        """AdamW with what sees as a group of its own, and a schedule that counts optimiser steps.
+    def parts(self) -> Parts:
+        """What is trained of the policy.
 
         Raises:
-            ConfigError: nothing of the policy is trained.
+            ConfigError: nothing is, or nothing of it is for Muon.
         """
-        rates = (self.learning_rate, self.backbone_learning_rate)
-        parts = zip(acting_and_seeing(self.policy), rates, strict=True)
-        groups = [{"params": parameters, "lr": rate} for parameters, rate in parts if parameters]
-        if not groups:
+        parts = parts_of(self.policy, muon=self.muon_learning_rate is not None)
+        if not any(parts):
             fix = "Let `requires_grad` of some of them be true."
             raise ConfigError("model.policy", "parameters that are trained", "none that are not frozen", fix)
+        if self.muon_learning_rate is not None and not parts.mixing:
+            fix = "Set it to null: AdamW trains all of this policy."
+            expected = "a policy with transformer layers that are trained"
+            raise ConfigError("model.muon_learning_rate", expected, type(self.policy).__name__, fix)
+        return parts
+
+    def configure_optimizers(self) -> OptimizerLRScheduler:
+        """AdamW with what sees as a group of its own, Muon for matrices if wanted, and a schedule that counts steps.
+
+        Raises:
+            ConfigError: nothing of the policy is trained, or nothing of it is for Muon.
+        """
+        acting, seeing, mixing = self.parts()
+        pairs = ((acting, self.learning_rate), (seeing, self.backbone_learning_rate))
+        groups = [{"params": part, "lr": rate} for part, rate in pairs if part]
         fused = not str(self.trainer.precision).endswith("-mixed")  # Lightning clips no gradients of a fused one then
-        optimizer = torch.optim.AdamW(
-            groups, lr=self.learning_rate, betas=self.betas, weight_decay=self.weight_decay, fused=fused
-        )
+        settings: Any = {"betas": self.betas, "weight_decay": self.weight_decay, "fused": fused}
+        optimizer: torch.optim.Optimizer
+        if mixing and self.muon_learning_rate is not None:
+            optimizer = MuonAndAdamW(mixing, self.muon_learning_rate, groups, **settings)
+        else:
+            optimizer = torch.optim.AdamW(groups, lr=self.learning_rate, **settings)
         total = int(self.trainer.estimated_stepping_batches) if self.schedule != "constant" else 0
         scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, lambda step: self.learning_rate_factor(step, total))
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": scheduler, "interval": "step"}}

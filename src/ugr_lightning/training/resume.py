@@ -12,7 +12,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from ugr_lightning.contract import ChunkPolicy, Statistics
 from ugr_lightning.errors import CheckpointError
 from ugr_lightning.models.checkpoint import describe
-from ugr_lightning.training.module import acting_and_seeing
+from ugr_lightning.training.optimizer import Parts
 
 HONOURED = (
     *("seed_everything", "model.", "average.", "checkpoints.", "data.batch_size", "data.sampling."),
@@ -46,8 +46,13 @@ def check_weights(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> N
         raise CheckpointError(path, f"the weights of the policy in the config, {expected}", got, fix)
 
 
-def check_training(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> None:
+def check_training(path: Path, content: dict[str, Any], parts: Parts) -> None:
     """Make sure that a checkpoint holds a training of such a policy and not only weights.
+
+    Args:
+        path: of the checkpoint.
+        content: what it holds.
+        parts: what is trained of the policy.
 
     Raises:
         CheckpointError: it was imported or exported, or its optimiser divides the parameters in another way.
@@ -57,7 +62,7 @@ def check_training(path: Path, content: dict[str, Any], policy: ChunkPolicy) -> 
         fix = "It can be rolled out, exported and scored; a training goes on from a checkpoint of `ugr fit` only."
         raise CheckpointError(path, "the state of a training", f"weights only (no {', '.join(missing)})", fix)
     before = [len(group["params"]) for state in content["optimizer_states"] for group in state["param_groups"]]
-    now = [len(part) for part in acting_and_seeing(policy) if part]
+    now = [len(part) for part in parts if part]
     if before != now:
         fix = "It is of another version of this package: go on with that one, or train afresh without --checkpoint."
         if sum(before) != sum(now):
