@@ -23,7 +23,7 @@ COMMANDS: dict[str, tuple[str, str]] = {
     "predict": ("predict", "a checkpoint's commands beside those of demonstrations, by joint"),
     "analyze": ("analyze", "whether a checkpoint's uncertainty knows the error"),
     "alarm": ("alarm", "set the alarm that rollouts and bridges raise before a checkpoint fails"),
-    "reach": ("reach", "refine a trained policy towards where it sees that each hand will grip"),
+    "refine": ("refine", "fit a refinement to a policy that is trained"),
     "sweep": ("sweep", "one checkpoint with many budgets and executions, in closed loop"),
     "benchmark": ("benchmark.command", "policies, tasks and training seeds of one yaml: record, train, evaluate"),
     "shards": ("shards", "collect, rollout, test or sweep in parts on a cluster, put together here"),

@@ -47,6 +47,7 @@ class Plan(NamedTuple):
         refined: (B, K) bool, m; None where nothing refines.
         sighting: the hands' next keyframes; None where the policy does not look for them.
         hidden: (B, K, D) float32, H_0.
+        reaching: (B, K, A) float32, what the `reach` branch starts from: A_0 with the correction of its `mlp`.
     """
 
     actions: Tensor
@@ -55,6 +56,21 @@ class Plan(NamedTuple):
     refined: Tensor | None
     sighting: Sighting | None
     hidden: Tensor
+    reaching: Tensor
+
+
+class Refined(NamedTuple):
+    """A refined chunk in normalised units.
+
+    Args:
+        actions: (B, K, A) float32, A_1.
+        chosen: (B, K) bool, m; None where nothing refines.
+        reaching: (B, K, A) float32, what the `reach` branch starts from.
+    """
+
+    actions: Tensor
+    chosen: Tensor | None
+    reaching: Tensor
 
 
 class ACT(TokenPolicy):
@@ -260,8 +276,8 @@ class ACT(TokenPolicy):
             kl_weight=self.kl_weight,
         )
         if self.reach is not None and plan.sighting is not None:
-            robot, points = self.normalizer.robot_action(plan.coarse.detach()), plan.sighting.points[:, :, 0]
-            terms["reach"] = self.reach.lesson(plan.hidden, robot, points, batch.actions, acting)
+            start, points = self.normalizer.robot_action(plan.reaching.detach()), plan.sighting.points[:, :, 0]
+            terms["reach"] = self.reach.lesson(plan.hidden, start, points, batch.actions, acting)
             total = total + terms["reach"]
         return self.lesson({"loss": total, **terms}, plan.sighting)
 
@@ -318,23 +334,45 @@ class ACT(TokenPolicy):
             coarse = self.action_head(whole)  # (B, K, A), A_0
             if self.uncertainty_head is not None:
                 log_variance = self.uncertainty_head(whole.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
+        points = None if sighting is None else sighting.points[:, :, 0]  # (B, 2, 3), the tools
+        actions, chosen, reaching = self.refined(hidden, coarse, log_variance, points, valid, (memory, memory_keys))
+        return Plan(actions, coarse, log_variance, chosen, sighting, whole, reaching)
+
+    def refined(
+        self,
+        hidden: Tensor,
+        coarse: Tensor,
+        log_variance: Tensor | None,
+        points: Tensor | None,
+        valid: Tensor,
+        memory: tuple[Tensor, Tensor] | None = None,
+    ) -> Refined:
+        """A_1 of A_0; paper, Eq. (3) to (5).
+
+        Args:
+            hidden: (B, K, D), H_0.
+            coarse: (B, K, A) float32, A_0, normalised.
+            log_variance: (B, K) float32, s; None without an uncertainty head.
+            points: (B, 2, 3) where the tools' next keyframes are seen, m; None without keyframes.
+            valid: (B, K) bool, False on padded steps.
+            memory: (B, N, D) twice, without and with positions, for the branch `decoder`.
+        """
         if self.refine is None or self.branch is None:
-            return Plan(coarse, coarse, log_variance, None, sighting, whole)
-        hint = None if log_variance is None else log_variance.detach()
-        refined = self.refine.select(hint, valid, self.training)  # (B, K), m
+            return Refined(coarse, None, coarse)
+        chosen = self.refine.select(None if log_variance is None else log_variance.detach(), valid, self.training)
         start = coarse.detach() if self.refine_detach_coarse else coarse
-        with autocast(self.precision, state.device):
+        with autocast(self.precision, coarse.device):
             if self.branch.stepwise and self.budget is not None and not torch.is_grad_enabled():
-                residual = self.branch.at(refined, self.budget, hidden, start)  # (B, K, A), m * dA
+                residual = self.branch.at(chosen, self.budget, hidden, start)  # (B, K, A), m * dA
             else:
-                residual = self.branch(hidden, start, self.query_embed, memory, memory_keys)  # (B, K, A), dA
-        if self.reach is not None and sighting is not None:
-            with full_precision(state.device):
-                robot, points = self.normalizer.robot_action(start), sighting.points[:, :, 0]  # (B, K, A), (B, 2, 3)
-                motion = self.reach(whole, robot, points) / self.normalizer.action_scale  # (B, K, A)
-                residual = residual + motion.detach()  # it has a lesson of its own
-        actions = start + refined[..., None] * residual  # (B, K, A), A_1 = A_0 + m * dA
-        return Plan(actions, coarse, log_variance, refined, sighting, whole)
+                residual = self.branch(hidden, start, self.query_embed, memory)  # (B, K, A), dA
+        reaching = start + residual  # (B, K, A)
+        if self.reach is not None and points is not None:
+            with full_precision(coarse.device):
+                start_robot = self.normalizer.robot_action(reaching)  # (B, K, A)
+                motion = self.reach(hidden.float(), start_robot, points)  # (B, K, A)
+                residual = residual + (motion / self.normalizer.action_scale).detach()  # it has a lesson of its own
+        return Refined(start + chosen[..., None] * residual, chosen, reaching)  # A_1 = A_0 + m * dA
 
     def _lessons(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Which steps (B, K) teach the actions, and which the uncertainty; the same, unless episodes are held out."""

@@ -12,13 +12,12 @@ def build(kind: str) -> ResidualBranch:
     return branch
 
 
-def inputs() -> tuple[torch.Tensor, ...]:
+def inputs():
     return (
         torch.randn(3, 10, 16),
         torch.randn(3, 10, 14),
         torch.randn(10, 16),
-        torch.randn(3, 7, 16),
-        torch.randn(3, 7, 16),
+        (torch.randn(3, 7, 16), torch.randn(3, 7, 16)),
     )
 
 

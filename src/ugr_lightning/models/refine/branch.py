@@ -41,7 +41,7 @@ class ResidualBranch(nn.Module):
         return self.mlp is not None
 
     def forward(
-        self, hidden: Tensor, coarse: Tensor, query_position: Tensor, memory: Tensor, memory_keys: Tensor
+        self, hidden: Tensor, coarse: Tensor, query_position: Tensor, memory: tuple[Tensor, Tensor] | None
     ) -> Tensor:
         """Corrections of all steps.
 
@@ -49,8 +49,7 @@ class ResidualBranch(nn.Module):
             hidden: (B, K, D) coarse hidden states.
             coarse: (B, K, A) coarse actions, normalised.
             query_position: (K, D).
-            memory: (B, N, D).
-            memory_keys: (B, N, D) memory with its positions added.
+            memory: (B, N, D) without and with positions added; a stepwise branch needs none.
 
         Returns:
             (B, K, A) float32.
@@ -58,8 +57,8 @@ class ResidualBranch(nn.Module):
         x = hidden + self.action_proj(coarse)  # (B, K, D)
         if self.mlp is not None:
             x = self.mlp(x)
-        elif self.layer is not None:
-            x = self.layer(x, query_position, memory, memory_keys)
+        elif self.layer is not None and memory is not None:
+            x = self.layer(x, query_position, *memory)
         correction: Tensor = self.head(x).float()
         return correction
 
