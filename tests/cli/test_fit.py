@@ -7,6 +7,7 @@ import sys
 from collections import Counter
 from pathlib import Path
 
+import deployed
 import pytest
 import torch
 import yaml
@@ -185,6 +186,61 @@ def test_what_is_learned_by_may_change_on_the_way_and_is_said(tiny_config, capsy
     if name in group:
         assert str(list(group[name]) if name == "betas" else group[name]) == HONOURED[key]
     assert yaml.safe_load((RUN / "config.yaml").read_text())["run"] == "tiny"
+
+
+@pytest.fixture
+def muon_config(tiny_config):
+    """Config of a training with Muon, of a policy that has transformer layers."""
+    sizes = deployed.TINY | {"dropout": 0.1, "chunk_length": 5}
+    policy = {"class_path": "ugr_lightning.models.act.ACT", "init_args": sizes}
+    config = yaml.safe_load(Path(tiny_config).read_text())
+    config["model"] = {"learning_rate": 1e-3, "muon_learning_rate": 1e-3, "policy": policy}
+    Path(tiny_config).write_text(yaml.safe_dump(config))
+    return tiny_config
+
+
+@pytest.mark.parametrize("options", [[], ["--trainer.precision", "bf16-mixed", "--trainer.gradient_clip_val", "1"]])
+def test_a_training_with_muon_that_goes_on_from_last_equals_the_uninterrupted_one(muon_config, options):
+    fit(muon_config, *options, "--run", "straight")
+    fit(muon_config, *options, "--trainer.max_steps", "3")
+    fit(muon_config, *options, "--checkpoint", "last")
+    a, b = weights(RUN), weights(Path("runs/straight/version_0"))
+    assert all(torch.equal(a[name], b[name]) for name in a)
+
+
+def test_muons_rate_may_change_on_the_way_and_is_said(muon_config, capsys):
+    fit(muon_config, "--trainer.max_steps", "3")
+    fit(muon_config, "--checkpoint", "last", "--model.muon_learning_rate", "0.5")
+    assert "from here on: model.muon_learning_rate 0.001 -> 0.5\n" in capsys.readouterr().out
+    groups = torch.load(RUN / "last.ckpt", weights_only=True)["optimizer_states"][0]["param_groups"]
+    assert [group["lr"] for group in groups] == [1e-3, 1e-3, 0.5]
+
+
+@pytest.mark.parametrize(("before", "now"), [("0.001", "null"), ("null", "0.001")])
+def test_muon_may_not_be_switched_on_or_off_on_the_way(muon_config, capsys, before, now):
+    fit(muon_config, "--trainer.max_steps", "3", "--model.muon_learning_rate", before)
+    written = files_of(Path("runs"))
+    assert main(["fit", "--config", muon_config, "--checkpoint", "last", "--model.muon_learning_rate", now]) == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"Set `model.muon_learning_rate` to {before}, or train afresh" in said
+    assert files_of(Path("runs")) == written
+
+
+@pytest.mark.parametrize(
+    ("says", "options"),
+    [
+        ("torch 2.9 or later", []),
+        ("got TinyPolicy", ["--model.policy", "tiny.TinyPolicy", "--model.policy.dim", "14"]),
+    ],
+)
+def test_muon_that_cannot_train_is_refused_before_demonstrations_are_looked_for(
+    muon_config, monkeypatch, capsys, says, options
+):
+    monkeypatch.delattr(torch.optim, "Muon")
+    assert main(["fit", "--config", muon_config, *options, "--data.root", "nowhere"]) == 2
+    assert says in capsys.readouterr().err
+    assert not list(Path("runs").rglob("version_*"))
+    assert not Path("nowhere").exists()
 
 
 REFUSED = {

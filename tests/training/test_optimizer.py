@@ -6,6 +6,7 @@ import pytest
 import torch
 from deployed import looking_act
 from lightning.pytorch import Trainer
+from tiny import TinyPolicy
 from torch.optim import AdamW, Muon
 from torch.optim.lr_scheduler import LambdaLR
 
@@ -42,6 +43,30 @@ def test_muon_trains_the_matrices_of_transformer_layers_and_nothing_else():
         *("self_attn.in_proj_weight", "self_attn.out_proj.weight", "linear1.weight", "linear2.weight"),
     }
     assert not parts_of(policy, muon=False).mixing
+
+
+class OwnPolicy(TinyPolicy):
+    """Made of torch's own transformer layers, one of which sees."""
+
+    def __init__(self):
+        super().__init__()
+        self.backbone = torch.nn.TransformerEncoderLayer(4, 2, 8)
+        self.encoder, self.decoder = (
+            torch.nn.TransformerEncoderLayer(4, 2, 8),
+            torch.nn.TransformerDecoderLayer(4, 2, 8),
+        )
+
+
+def test_torchs_own_transformer_layers_are_found_but_what_sees_stays_with_its_own_rate():
+    policy = OwnPolicy()
+    policy.encoder.linear1.requires_grad_(False)
+    acting, seeing, mixing = parts_of(policy, muon=True)
+    assert {id(one) for one in seeing} == {id(one) for one in policy.backbone.parameters()}
+    layers = torch.nn.ModuleList([policy.encoder, policy.decoder])
+    matrices = {id(one) for one in layers.parameters() if one.dim() == 2 and one.requires_grad}
+    assert {id(one) for one in mixing} == matrices
+    assert len(matrices) == 9
+    assert {id(one) for one in policy.trunk.parameters()} <= {id(one) for one in acting}
 
 
 def test_the_module_gives_muon_its_own_rate():
@@ -98,4 +123,5 @@ def test_saved_and_restored_it_goes_on_as_if_it_had_not_stopped():
 def test_a_torch_without_muon_is_named(monkeypatch):
     monkeypatch.delattr(torch.optim, "Muon")
     with pytest.raises(ConfigError, match=r"muon_learning_rate: expected torch 2\.9 or later, got "):
-        joined(some())
+        PolicyModule(looking_act(), muon_learning_rate=1e-3).parts()
+    assert PolicyModule(looking_act()).parts().acting

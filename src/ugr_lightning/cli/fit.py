@@ -243,12 +243,13 @@ class UGRCLI(LightningCLI):
         self.trainer.validate(ckpt_path=self._get(self.config, "checkpoint"), **given)
 
     def before_fit(self) -> None:
-        """Find out whether the training may go on from the checkpoint, before anything of the run is touched."""
+        """Find out whether the training may begin or go on, before anything is recorded, decoded or touched."""
+        parts = self.model.parts()
         content = self._check_weights()
         if content is None or not _is_first_process():
             return
         path = Path(self._get(self.config, "checkpoint"))
-        check_training(path, content, self.model.parts())
+        check_training(path, content, parts)
         self.datamodule.prepare_data()
         self.datamodule.setup("fit")
         check_data(path, content, self.model.policy, self.datamodule)

@@ -164,7 +164,7 @@ class PolicyModule(LightningModule):
         """What is trained of the policy.
 
         Raises:
-            ConfigError: nothing is, or nothing of it is for Muon.
+            ConfigError: nothing is, nothing of it is for Muon, or this torch has no Muon.
         """
         parts = parts_of(self.policy, muon=self.muon_learning_rate is not None)
         if not any(parts):
@@ -174,13 +174,16 @@ class PolicyModule(LightningModule):
             fix = "Set it to null: AdamW trains all of this policy."
             expected = "a policy with transformer layers that are trained"
             raise ConfigError("model.muon_learning_rate", expected, type(self.policy).__name__, fix)
+        if parts.mixing and not hasattr(torch.optim, "Muon"):
+            fix = "Set it to null, or update torch."
+            raise ConfigError("model.muon_learning_rate", "torch 2.9 or later", torch.__version__, fix)
         return parts
 
     def configure_optimizers(self) -> OptimizerLRScheduler:
         """AdamW with what sees as a group of its own, Muon for matrices if wanted, and a schedule that counts steps.
 
         Raises:
-            ConfigError: nothing of the policy is trained, or nothing of it is for Muon.
+            ConfigError: as `parts`.
         """
         acting, seeing, mixing = self.parts()
         pairs = ((acting, self.learning_rate), (seeing, self.backbone_learning_rate))

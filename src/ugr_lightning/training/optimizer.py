@@ -7,9 +7,10 @@ from torch import nn
 from torch.optim import AdamW, Optimizer
 
 from ugr_lightning.contract import ChunkPolicy
-from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.transformer import DecoderLayer, EncoderLayer
 
+LAYERS = (EncoderLayer, DecoderLayer, nn.TransformerEncoderLayer, nn.TransformerDecoderLayer)
+"""Ours, and torch's in a policy of a user's own."""
 SEEING = ("backbone", "finder")
 """Words in the names of the parameters that see: the backbone and the keyframes' maps."""
 
@@ -20,7 +21,7 @@ class Parts(NamedTuple):
     Args:
         acting: all that is in no other part.
         seeing: the backbone and the keyframes' maps.
-        mixing: the matrices of transformer layers, if they are Muon's.
+        mixing: the matrices of transformer layers that do not see, if they are Muon's.
     """
 
     acting: list[nn.Parameter]
@@ -35,13 +36,13 @@ def parts_of(policy: ChunkPolicy, *, muon: bool) -> Parts:
         policy: whose frozen parameters are left out.
         muon: whether the matrices of transformer layers are a part of their own.
     """
-    layers = [module for module in policy.modules() if isinstance(module, EncoderLayer | DecoderLayer)] if muon else []
+    layers = [module for module in policy.modules() if isinstance(module, LAYERS)] if muon else []
     matrices = {id(parameter) for layer in layers for parameter in layer.parameters() if parameter.dim() == 2}
     parts = Parts([], [], [])
     for name, parameter in policy.named_parameters():
         if parameter.requires_grad:
-            seen = parts.seeing if any(word in name for word in SEEING) else parts.acting
-            (parts.mixing if id(parameter) in matrices else seen).append(parameter)
+            acts = parts.mixing if id(parameter) in matrices else parts.acting
+            (parts.seeing if any(word in name for word in SEEING) else acts).append(parameter)
     return parts
 
 
@@ -56,9 +57,6 @@ class MuonAndAdamW(Optimizer):
         others: groups of parameters for AdamW, with their rates; they come first in `param_groups`.
         weight_decay: of all groups.
         settings: AdamW's.
-
-    Raises:
-        ConfigError: this torch has no Muon.
     """
 
     def __init__(
@@ -70,9 +68,6 @@ class MuonAndAdamW(Optimizer):
         weight_decay: float,
         **settings: Any,
     ) -> None:
-        if not hasattr(torch.optim, "Muon"):
-            fix = "Set it to null, or update torch."
-            raise ConfigError("model.muon_learning_rate", "torch 2.9 or later", torch.__version__, fix)
         self.parts: tuple[Optimizer, ...] = (
             AdamW(others, weight_decay=weight_decay, **settings),
             torch.optim.Muon(matrices, rate, weight_decay, adjust_lr_fn="match_rms_adamw"),

@@ -61,7 +61,13 @@ def check_training(path: Path, content: dict[str, Any], parts: Parts) -> None:
     if missing:
         fix = "It can be rolled out, exported and scored; a training goes on from a checkpoint of `ugr fit` only."
         raise CheckpointError(path, "the state of a training", f"weights only (no {', '.join(missing)})", fix)
-    before = [len(group["params"]) for state in content["optimizer_states"] for group in state["param_groups"]]
+    groups = [group for state in content["optimizer_states"] for group in state["param_groups"]]
+    rate = next((group["initial_lr"] for group in groups if "ns_steps" in group), "null")  # AdamW has no such setting
+    if (rate == "null") == bool(parts.mixing):
+        expected, got = ("with Muon", "without") if parts.mixing else ("without Muon", "with it")
+        fix = f"Set `model.muon_learning_rate` to {rate}, or train afresh without --checkpoint."
+        raise CheckpointError(path, f"a training {expected}", f"one {got}", fix)
+    before = [len(group["params"]) for group in groups]
     now = [len(part) for part in parts if part]
     if before != now:
         fix = "It is of another version of this package: go on with that one, or train afresh without --checkpoint."
