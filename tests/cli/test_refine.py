@@ -15,6 +15,8 @@ from ugr_lightning.models.checkpoint import load_policy
 from ugr_lightning.models.refine.full import Full
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.sim.kinematics import HOME, SIDES, forward, to_world
+from ugr_lightning.uncertainty import refitting
+from ugr_lightning.uncertainty.predictions import batches
 
 STEPS = 12
 
@@ -53,6 +55,7 @@ def test_a_policy_learns_to_refine_and_keeps_everything_else(
     trained, _ = load_policy(tmp_path / "policy_best.ckpt")
     refined, info = load_policy(tmp_path / "policy_best_refined.ckpt")
     assert info.data["task"] == "click_alarmclock"
+    assert info.step == 7
     kept = trained.state_dict()
     for name, value in refined.state_dict().items():
         if not name.startswith(("reach.", "branch.")):
@@ -96,3 +99,45 @@ def test_other_arms_and_other_policies_are_refused(ten_demonstrations, untrained
     assert main(command(tmp_path, ten_demonstrations)) == 2
     assert "class ACT" in capsys.readouterr().err
     assert not (tmp_path / "policy_best_refined.ckpt").exists()
+
+
+def test_before_is_what_the_checkpoint_does_also_if_it_refines(ten_demonstrations, untrained, tmp_path, capsys):
+    policy = tiny_act(refine=Uncertainty())
+    torch.nn.init.normal_(policy.branch.head.weight)
+    untrained(policy, tmp_path)
+    said = []
+    for name in ("policy_best.ckpt", "policy_best_refined.ckpt"):
+        assert main(["refine", str(tmp_path / name), *command(tmp_path, ten_demonstrations)[2:]]) == 0
+        said.append(re.search(r"action error .*: (\S+) and (\S+)", capsys.readouterr().out).groups())
+    assert said[1][0] == said[0][1]
+
+
+def test_a_file_that_is_there_is_not_overwritten(ten_demonstrations, untrained, tmp_path, capsys):
+    file = untrained(tiny_act(), tmp_path)
+    before = file.read_bytes()
+    for out in (file, tmp_path):
+        assert main(command(tmp_path, ten_demonstrations, "--out", str(out))) == 2
+        assert "a file that does not exist yet" in capsys.readouterr().err
+    assert file.read_bytes() == before
+
+
+def test_a_rule_is_told_no_uncertainty_where_the_policy_has_none(ten_demonstrations, untrained, tmp_path, monkeypatch):
+    told, select = [], Full.select
+    monkeypatch.setattr(Full, "select", lambda self, *given: told.append(given[0]) or select(self, *given))
+    untrained(tiny_act(), tmp_path)
+    assert main(command(tmp_path, ten_demonstrations)) == 0
+    assert told
+    assert all(one is None for one in told)
+
+
+def test_episodes_that_teach_the_uncertainty_alone_teach_no_refinement(
+    ten_demonstrations, untrained, tmp_path, monkeypatch
+):
+    asked = []
+    monkeypatch.setattr(
+        refitting, "batches", lambda data, episodes, **how: asked.append(episodes) or batches(data, episodes, **how)
+    )
+    untrained(tiny_act(refine=Uncertainty(), uncertainty_holdout=2), tmp_path)
+    assert main(command(tmp_path, ten_demonstrations)) == 0
+    assert asked[0]
+    assert all(episode % 2 for episode in asked[0])

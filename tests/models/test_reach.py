@@ -57,6 +57,11 @@ def test_a_branch_that_has_learned_nothing_changes_nothing(postures):
     assert not added.any()
 
 
+def test_a_batch_without_a_step_that_counts_teaches_nothing(postures):
+    shown, none = commands(postures), torch.zeros(3, STEPS, dtype=torch.bool)
+    assert taught(0.5).lesson(torch.zeros(3, STEPS, DIM), shown, torch.zeros(3, 2, 3), shown, none) == 0
+
+
 def test_a_whole_share_brings_the_tools_to_the_points_and_leaves_the_grippers(postures):
     points = tools_in_world(postures) + torch.tensor([0.01, -0.008, 0.006])
     coarse = commands(postures)

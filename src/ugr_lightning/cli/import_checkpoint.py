@@ -39,7 +39,7 @@ def _import_act(
     from ugr_lightning.bridges.act_statistics import read_act_statistics
     from ugr_lightning.models.checkpoint import read_checkpoint
 
-    _require_new(out)
+    require_new(out)
     numbers = read_act_statistics(statistics or Path(checkpoint).with_name("dataset_stats.pkl"))
     content = read_checkpoint(checkpoint)
     policy, extra = import_act(content, numbers, cameras=cameras, heads=heads, precision=precision, where=checkpoint)
@@ -72,14 +72,15 @@ def _import_lerobot(
     """
     from ugr_lightning.bridges.lerobot_policy import import_lerobot
 
-    _require_new(out)
+    require_new(out)
     policy, size, notes = import_lerobot(Path(folder), cameras=cameras, precision=precision)
     _save(out, policy, {"task": task, "image_size": image_size or size, "state": "commanded"}, {})
     print("\n".join(f"note        {note}" for note in notes))
     return 0
 
 
-def _require_new(out: str) -> None:
+def require_new(out: str) -> None:
+    """Refuse to overwrite a file."""
     if Path(out).exists():
         raise ConfigError("--out", "a file that does not exist yet", out, "Choose another name, or delete it.")
 

@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
+from ugr_lightning.cli.import_checkpoint import require_new
 from ugr_lightning.cli.parsing.call import Count, call
 from ugr_lightning.errors import CheckpointError
 from ugr_lightning.models.refine.selector import Selector
@@ -32,7 +33,8 @@ def _refine(
             arms).
         data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
         stride: control steps between two of the chunks that it learns from.
-        out: checkpoint to write; null means `<checkpoint>_refined.ckpt` beside the checkpoint.
+        out: checkpoint to write, which must not exist; null means `<checkpoint>_refined.ckpt` beside the checkpoint,
+            in place of an earlier one.
     """
     import torch
 
@@ -44,23 +46,24 @@ def _refine(
     from ugr_lightning.uncertainty.predictions import batches, open_data
     from ugr_lightning.uncertainty.refitting import fit_refinement, with_refinement
 
+    if out:
+        require_new(out)
     file = resolve_checkpoint(checkpoint, run, root)
     policy, info = load_policy(file)
     if not isinstance(policy, ACT):
         raise CheckpointError(file, "a policy of the class ACT", type(policy).__name__, "Choose another checkpoint.")
-    opened = open_data(policy, info.trained_on, data)
     torch.manual_seed(0)
     refining = with_refinement(policy, refine or Full(), refine_branch)
+    opened = open_data(policy, info.trained_on, data)
     fit_refinement(refining, opened, stride=stride)
     path = Path(out) if out else file.with_name(f"{file.stem}_refined.ckpt")
-    save_policy(path, refining, dict(info.data))
+    save_policy(path, refining, dict(info.data), {"global_step": info.step, "epoch": info.epoch})
     forward, std = known_kinematics(opened), opened.statistics.action_std
     error: tuple[list[torch.Tensor], ...] = ([], [])  # before and after
     tools: tuple[list[torch.Tensor], ...] = ([], [])
     for batch in batches(opened, opened.episode_split.validation, stride=stride):
-        chunk = refining.predict(batch.observation)
-        assert chunk.coarse is not None
-        for side, actions in enumerate((chunk.coarse, chunk.actions)):
+        for side, one in enumerate((policy, refining)):
+            actions = one.predict(batch.observation).actions
             error[side].append(((actions - batch.actions).abs() / std)[batch.valid])
             if forward is not None and batch.keyframes is not None:
                 tools[side].append(event_errors(forward, actions, batch))

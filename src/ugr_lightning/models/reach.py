@@ -8,6 +8,7 @@ from ugr_lightning.contract import Batch
 from ugr_lightning.embodiment import BASE_X, FOREARM, SHOULDER_HEIGHT, TOOL_LENGTH, UPPER_ARM
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.keyframes import inverse_matrix
+from ugr_lightning.models.losses import mean_over
 
 TURNS_ABOUT = (2, 1, 1, 0, 1, 0)
 """The axis that each joint turns about, of the frame that it stands in."""
@@ -76,7 +77,7 @@ class Reach(nn.Module):
         share, beside = self._shares(hidden.detach(), tool, points)
         missed = tools_of(_joints(shown))[0] - tool  # (B, K, 2, 3)
         left = (missed - share[..., None] * beside).norm(dim=-1).mean(-1)  # (B, K)
-        return (left * valid).sum() / valid.sum() / NEARNESS[0]
+        return mean_over(left, valid) / NEARNESS[0]
 
     def _shares(self, hidden: Tensor, tool: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
         """Which share of its way each tool goes, (B, K, 2), and that way, (B, K, 2, 3) m."""

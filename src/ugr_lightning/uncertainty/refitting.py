@@ -94,7 +94,8 @@ def fit_refinement(policy: ACT, data: ChunkDataModule, *, stride: int) -> None:
 
 def _lesson(policy: ACT, known: Known) -> Tensor:
     hidden, shown = known.hidden.float(), known.shown
-    done = policy.refined(hidden, known.coarse, known.log_variance, known.points, known.valid)
+    doubt = None if policy.uncertainty_head is None else known.log_variance
+    done = policy.refined(hidden, known.coarse, doubt, known.points, known.valid)
     assert done.chosen is not None
     target = policy.normalizer.action(shown)  # (B, K, A)
     missed = refine_loss(done.actions, target, done.chosen, known.valid, policy.reconstruction)
@@ -110,7 +111,9 @@ def _known(policy: ACT, data: ChunkDataModule, stride: int) -> Known:
     hook = policy.action_head.register_forward_hook(
         lambda _, inputs, coarse: given.update(hidden=inputs[0], coarse=coarse)
     )
-    for batch in batches(data, data.episode_split.train, stride=stride):
+    every = policy.uncertainty_holdout  # of these episodes the actions teach the uncertainty only
+    episodes = tuple(episode for episode in data.episode_split.train if not every or episode % every)
+    for batch in batches(data, episodes, stride=stride):
         if policy.reach is not None and batch.keyframes is None:
             fix = "Give the folder with the recording that the policy was trained on, with --data."
             raise ConfigError("demonstrations", "keyframes", "none", fix)
