@@ -2,11 +2,13 @@
 
 import pytest
 import torch
+from deployed import tiny_act
 
 from ugr_lightning.blueprint import rebuild
 from ugr_lightning.contract import Observation
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError
 from ugr_lightning.models.act import ACT
+from ugr_lightning.models.keyframes import KeyframeSettings
 from ugr_lightning.models.losses import refine_loss
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
@@ -249,6 +251,14 @@ def test_inference_copy_predicts_the_same(tiny, batch, norm, precision):
     assert policy.training
     assert not any(parameter.requires_grad for parameter in fast.parameters())
     assert not any(isinstance(m, torch.nn.BatchNorm2d | FrozenBatchNorm2d) for m in fast.backbone.modules())
+
+
+def test_inference_copy_keeps_what_must_be_exact_whole():
+    policy = tiny_act(refine=Full(), refine_branch="reach", keyframes=KeyframeSettings(channels=8), precision="bf16")
+    fast = policy.for_inference()
+    exact = [p for name in ("action_head", "reach", "finder.axes") for p in fast.get_submodule(name).parameters()]
+    assert {parameter.dtype for parameter in exact} == {torch.float32}
+    assert fast.encoder[0].linear1.weight.dtype == torch.bfloat16
 
 
 def test_inference_copy_has_a_life_of_its_own(tiny, batch):

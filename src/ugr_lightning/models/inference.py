@@ -32,10 +32,11 @@ def store_weights_as(module: nn.Module, dtype: torch.dtype, keep: Collection[str
     Args:
         module: what to convert.
         dtype: the arithmetic of its trunk.
-        keep: names of the layers that stay as they are.
+        keep: names of the parts that stay as they are, with all that is in them.
     """
     for name, layer in module.named_modules():
-        if isinstance(layer, (nn.Conv1d, nn.Conv2d, nn.ConvTranspose1d, nn.Linear, Attention)) and name not in keep:
+        weighs = isinstance(layer, (nn.Conv1d, nn.Conv2d, nn.ConvTranspose1d, nn.Linear, Attention))
+        if weighs and not any(f"{name}.".startswith(f"{part}.") for part in keep):
             for parameter in layer.parameters(recurse=False):
                 parameter.data = parameter.data.to(dtype)
 
