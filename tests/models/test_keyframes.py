@@ -13,6 +13,7 @@ from ugr_lightning.models.mirror import mirror_batch, mirror_joints, mirrored_st
 from ugr_lightning.models.refine.full import Full
 
 HEIGHT, WIDTH = 48, 64
+GRIPS = torch.zeros(2, 2)
 
 
 def looking(eye, target):
@@ -136,11 +137,11 @@ def test_maps_learn_a_place_and_moving_the_picture_moves_the_label(finder, proje
     optimiser = torch.optim.Adam(finder.parameters(), 1e-2)
     for _ in range(120):
         finder.train()
-        terms = finder(stages, projection, shift, keyframes).terms
+        terms = finder(stages, projection, shift, GRIPS, keyframes).terms
         optimiser.zero_grad()
         terms["keyframe"].backward()
         optimiser.step()
-    found = finder.eval()(stages, projection, shift, keyframes)
+    found = finder.eval()(stages, projection, shift, GRIPS, keyframes)
     assert found.terms["keyframe_px"] < 4  # a cell
     expected, inside = places_of(keyframes, projection)
     seen = inside & (moved.unflatten(0, (2, 3)).abs().amax(-1) < 1)
@@ -150,10 +151,46 @@ def test_maps_learn_a_place_and_moving_the_picture_moves_the_label(finder, proje
     ].abs().max() < 0.2
 
 
+@pytest.mark.parametrize("grips", [True, False])
+def test_the_same_pictures_mean_another_place_once_a_gripper_has_let_go(projection, keyframes, grips):
+    torch.manual_seed(0)
+    finder = KeyframeFinder(KeyframeSettings(channels=16, grips=grips), (8, 16, 32), 3)
+    finder.centre.copy_(keyframes.position.mean(0))
+    after = keyframes._replace(position=keyframes.position + torch.tensor([0.0, 0.12, 0.0]))
+    stages = (torch.rand(1, 8, 12, 16), torch.rand(1, 16, 6, 8), torch.rand(1, 32, 3, 4))
+    stages = tuple(stage.expand(6, -1, -1, -1) for stage in stages)
+    shift, closed, opened = torch.zeros(6, 2), torch.zeros(2, 2), torch.ones(2, 2)
+    optimiser = torch.optim.Adam(finder.parameters(), 1e-2)
+    for _ in range(100):
+        optimiser.zero_grad()
+        for grip, labels in ((closed, keyframes), (opened, after)):
+            finder(stages, projection, shift, grip, labels).terms["keyframe"].backward()
+        optimiser.step()
+    errors = [
+        finder(stages, projection, shift, grip, labels).terms["keyframe_px"].item()
+        for grip, labels in ((closed, keyframes), (opened, after))
+    ]
+    assert (max(errors) < 2) == grips
+
+
+def test_with_context_a_cell_sees_farther_around(projection):
+    reach = {}
+    for context in ((), (2, 4)):
+        torch.manual_seed(0)
+        finder = KeyframeFinder(KeyframeSettings(channels=16, context=context), (8, 16, 32), 3)
+        first = torch.rand(3, 8, 24, 32, requires_grad=True)
+        features = finder._features((first, torch.rand(3, 16, 12, 16), torch.rand(3, 32, 6, 8)), 3, GRIPS[:1])
+        features[0, :, 12, 16].sum().backward()
+        rows = first.grad[0].abs().sum((0, 2)).nonzero().squeeze(1)
+        reach[context] = (rows.max() - rows.min() + 1).item()
+    assert reach == {(): 3, (2, 4): 3 + 2 * 2 + 2 * 4}
+
+
 @pytest.mark.parametrize("kind", ["act", "reach", "diffusion"])
 def test_a_policy_learns_with_keyframes_and_refuses_observations_without_calibration(tiny, seen, kind):
     samples, statistics = seen
-    settings = {"keyframes": KeyframeSettings(channels=8), "mirror": 0.5, "image_dropout": 0.4, "state_dropout": 0.3}
+    looks = KeyframeSettings(channels=8, context=(2,), grips=True)
+    settings = {"keyframes": looks, "mirror": 0.5, "image_dropout": 0.4, "state_dropout": 0.3}
     if kind != "diffusion":
         branch = {"refine": Full(), "refine_branch": "reach"} if kind == "reach" else {}
         policy = tiny(backbone_stem="unshuffle", keypoints=2, image_shift=4, **branch, **settings)

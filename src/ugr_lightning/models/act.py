@@ -321,7 +321,7 @@ class ACT(TokenPolicy):
         """From inputs in network units to a chunk in network units; the paper's Eq. (2) to (5) in order."""
         with autocast(self.precision, state.device):
             looked = self.look(self.backbone, self.pictures(observation).flatten(0, 2), len(self.cameras))
-            sighting = self.find_keyframes(looked, observation.projection, labels)
+            sighting = self.find_keyframes(looked, observation.projection, observation.state, labels)
             token = self.keyframe_token(sighting)  # (B, 1, D)
             memory, position = self.tokens(looked, state, latent, token, blind)  # (B, N, D), (N, D)
             for layer in self.encoder:

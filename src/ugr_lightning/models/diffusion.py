@@ -237,7 +237,7 @@ class DiffusionPolicy(PicturePolicy):
                 projection = projection.flatten(0, 1)  # (B T, V, 3, 4)
             if labels is not None:
                 labels = Keyframes(*(part.repeat_interleave(steps, dim=0) for part in labels))
-            sighting = self.find_keyframes(looked, projection, labels)
+            sighting = self.find_keyframes(looked, projection, state.flatten(0, 1), labels)
         state, blind = self.disturb(self.normalizer.state(state))  # (B, T, S), (B,)
         parts = [features.float().reshape(size, -1), state.flatten(1)]  # (B, ...) each
         if blind is not None:

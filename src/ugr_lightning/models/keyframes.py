@@ -38,12 +38,16 @@ class KeyframeSettings:
         weight: of the maps' loss in the policy's loss.
         noise: standard deviation, in image units, of the noise on the peaks that the policy is told in training.
         table_height: height of the table in the world, m, where the foot of a tool is.
+        context: dilations of further convolutions of the maps' features, which see farther around.
+        grips: tell the maps how open the grippers are: whether one has let go already, a picture hardly shows.
     """
 
     channels: int = 64
     weight: float = 0.05
     noise: float = 0.002
     table_height: float = 0.0
+    context: tuple[int, ...] = ()
+    grips: bool = False
 
 
 class Sighting(NamedTuple):
@@ -81,6 +85,8 @@ class KeyframeFinder(nn.Module):
         self.laterals = nn.ModuleList(nn.Conv2d(width, channels, 1) for width in widths)
         self.camera_embed = nn.Parameter(0.02 * torch.randn(cameras, channels))
         self.smooth = nn.Conv2d(channels, channels, 3, padding=1)
+        self.context = nn.ModuleList(nn.Conv2d(channels, channels, 3, padding=d, dilation=d) for d in settings.context)
+        self.grips = nn.Linear(ARMS, channels) if settings.grips else None
         self.maps = nn.Conv2d(channels, maps, 1)
         self.absent = nn.Linear(2 * channels, maps)
         self.axes = nn.Linear(POINTS * channels, AXES)
@@ -99,7 +105,12 @@ class KeyframeFinder(nn.Module):
         self.spread.copy_(statistics.keyframe_std)
 
     def forward(
-        self, stages: tuple[Tensor, Tensor, Tensor], projection: Tensor, shift: Tensor, labels: Keyframes | None = None
+        self,
+        stages: tuple[Tensor, Tensor, Tensor],
+        projection: Tensor,
+        shift: Tensor,
+        grips: Tensor,
+        labels: Keyframes | None = None,
     ) -> Sighting:
         """Find the keyframes of both arms.
 
@@ -107,10 +118,11 @@ class KeyframeFinder(nn.Module):
             stages: (B V, C, h, w) features of the backbone's first three stages; the first sets the maps' resolution.
             projection: (B, V, 3, 4), see `embodiment.image_projection`.
             shift: (B V, 2) how far each picture was moved, in image units.
+            grips: (B, 2) how open the grippers are, normalised.
             labels: what is to be found, in training and validation.
         """
         cameras = projection.shape[1]
-        features = self._features(stages, cameras)  # (B V, C, h, w)
+        features = self._features(stages, cameras, grips)  # (B V, C, h, w)
         chances = self._chances(features)  # (B V, 4, h w + 1) float32, logarithms
         with full_precision(features.device):  # millimetres need all digits
             return self._sighting(features.float(), chances, projection, shift, labels)
@@ -187,17 +199,21 @@ class KeyframeFinder(nn.Module):
         support = strength.sum((1, 3))  # (B, 2)
         return points, (strength * misses).sum((1, 3)) / support.clamp(min=1e-9), support
 
-    def _features(self, stages: tuple[Tensor, Tensor, Tensor], cameras: int) -> Tensor:
+    def _features(self, stages: tuple[Tensor, Tensor, Tensor], cameras: int, grips: Tensor) -> Tensor:
         """One map of features (B V, C, h, w) from three resolutions."""
         x: Tensor | None = None
         for lateral, stage in reversed(list(zip(self.laterals, stages, strict=True))):
             coarser = 0 if x is None else functional.interpolate(x, size=stage.shape[2:], mode="nearest")
             x = lateral(stage) + coarser
         assert x is not None
-        camera = self.camera_embed[:, :, None, None].to(x.dtype)  # (V, C, 1, 1)
-        x = functional.relu(x.unflatten(0, (-1, cameras)) + camera).flatten(0, 1)
-        smoothed: Tensor = functional.relu(self.smooth(x))
-        return smoothed
+        told = self.camera_embed  # (V, C)
+        if self.grips is not None:
+            told = told + self.grips(grips)[:, None]  # (B, V, C)
+        x = functional.relu(x.unflatten(0, (-1, cameras)) + told[..., None, None].to(x.dtype)).flatten(0, 1)
+        x = functional.relu(self.smooth(x))
+        for layer in self.context:
+            x = x + functional.relu(layer(x))
+        return x
 
     def _chances(self, features: Tensor) -> Tensor:
         """Log-probabilities of each map's cells, and of `not in this picture` behind them, (B V, 4, h w + 1)."""

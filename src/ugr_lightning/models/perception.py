@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ugr_lightning.contract import Batch, ChunkPolicy, Keyframes, Observation, Statistics
+from ugr_lightning.embodiment import last_of_each_arm
 from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.augmentation import jitter_colour, shift_images
 from ugr_lightning.models.inference import fold_normalisation, store_weights_as
@@ -171,8 +172,16 @@ class PicturePolicy(ChunkPolicy):
             x = jitter_colour(x, self.color_jitter, cameras)
         return Looked(backbone(x), shift)
 
-    def find_keyframes(self, looked: Looked, projection: Tensor | None, labels: Keyframes | None) -> Sighting | None:
+    def find_keyframes(
+        self, looked: Looked, projection: Tensor | None, state: Tensor, labels: Keyframes | None
+    ) -> Sighting | None:
         """The hands' next keyframes, where the policy looks for them.
+
+        Args:
+            looked: what the backbone makes of the pictures.
+            projection: (B, V, 3, 4); None without calibration.
+            state: (B, S) robot units, of which the grippers are told; never hidden.
+            labels: what is to be found, in training and validation.
 
         Raises:
             ConfigError: there is no calibration.
@@ -182,7 +191,8 @@ class PicturePolicy(ChunkPolicy):
         if projection is None:
             raise missing_keyframes("observations without calibrated cameras")
         first, second, third, _ = looked.stages
-        sighting: Sighting = self.finder((first, second, third), projection, looked.shift, labels)
+        grips = self.normalizer.state(state)[:, last_of_each_arm(state.shape[1])]  # (B, 2)
+        sighting: Sighting = self.finder((first, second, third), projection, looked.shift, grips, labels)
         return sighting
 
     def lesson(self, terms: dict[str, Tensor], sighting: Sighting | None) -> dict[str, Tensor]:
