@@ -144,9 +144,6 @@ class ChunkPolicy(Blueprinted, nn.Module, ABC):
     def set_statistics(self, statistics: Statistics) -> None:
         """Store the normalisation statistics in the policy's buffers."""
 
-    def check(self, batch: Batch) -> None:
-        """Refuse demonstrations that the policy cannot learn from; asked of the first batch of a training."""
-
     @abstractmethod
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """Named scalar loss terms of a batch; `loss` is the one to minimise, all others are for the log."""

@@ -8,7 +8,6 @@ from ugr_lightning.blueprint import rebuild
 from ugr_lightning.contract import Observation
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError
 from ugr_lightning.models.act import ACT
-from ugr_lightning.models.keyframes import KeyframeSettings
 from ugr_lightning.models.losses import refine_loss
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
@@ -253,11 +252,15 @@ def test_inference_copy_predicts_the_same(tiny, batch, norm, precision):
     assert not any(isinstance(m, torch.nn.BatchNorm2d | FrozenBatchNorm2d) for m in fast.backbone.modules())
 
 
-def test_inference_copy_keeps_what_must_be_exact_whole():
-    policy = tiny_act(refine=Full(), refine_branch="reach", keyframes=KeyframeSettings(channels=8), precision="bf16")
-    fast = policy.for_inference()
-    exact = [p for name in ("action_head", "reach", "finder.axes") for p in fast.get_submodule(name).parameters()]
-    assert {parameter.dtype for parameter in exact} == {torch.float32}
+def test_inference_copy_keeps_what_must_be_exact_with_all_that_is_in_it():
+    class Exact(ACT):
+        exact = ("action_head", "encoder.1")
+
+    fast = tiny_act(encoder_layers=2, precision="bf16")
+    fast.__class__ = Exact
+    fast = fast.for_inference()
+    assert {parameter.dtype for parameter in fast.encoder[1].parameters()} == {torch.float32}
+    assert fast.action_head.weight.dtype == torch.float32
     assert fast.encoder[0].linear1.weight.dtype == torch.bfloat16
 
 

@@ -10,7 +10,6 @@ from ugr_lightning.models.act import ACT
 from ugr_lightning.models.diffusion import DiffusionPolicy
 from ugr_lightning.models.keyframes import KeyframeFinder, KeyframeSettings, cross_entropy, peak, project
 from ugr_lightning.models.mirror import mirror_batch, mirror_joints, mirrored_statistics
-from ugr_lightning.models.refine.full import Full
 
 HEIGHT, WIDTH = 48, 64
 GRIPS = torch.zeros(2, 2)
@@ -186,21 +185,20 @@ def test_with_context_a_cell_sees_farther_around(projection):
     assert reach == {(): 3, (2, 4): 3 + 2 * 2 + 2 * 4}
 
 
-@pytest.mark.parametrize("kind", ["act", "reach", "diffusion"])
+@pytest.mark.parametrize("kind", ["act", "diffusion"])
 def test_a_policy_learns_with_keyframes_and_refuses_observations_without_calibration(tiny, seen, kind):
     samples, statistics = seen
     looks = KeyframeSettings(channels=8, context=(2,), grips=True)
     settings = {"keyframes": looks, "mirror": 0.5, "image_dropout": 0.4, "state_dropout": 0.3}
     if kind != "diffusion":
-        branch = {"refine": Full(), "refine_branch": "reach"} if kind == "reach" else {}
-        policy = tiny(backbone_stem="unshuffle", keypoints=2, image_shift=4, **branch, **settings)
+        policy = tiny(backbone_stem="unshuffle", keypoints=2, image_shift=4, **settings)
     else:
         sizes = {"unet_widths": (8, 16), "unet_groups": 4, "backbone_width": 8, "precision": "fp32"}
         policy = DiffusionPolicy(CAMERAS, 10, 1, False, **sizes, **settings)
     policy.set_statistics(statistics)
     terms = policy.train().losses(samples)
     terms["loss"].backward()
-    assert {"keyframe", "keyframe_px", "keyframe_mm", *({"reach"} if kind == "reach" else ())} <= set(terms)
+    assert {"keyframe", "keyframe_px", "keyframe_mm"} <= set(terms)
     assert [name for name, parameter in policy.named_parameters() if parameter.grad is None] == []
     chunk = policy.predict(samples.observation)
     assert chunk.maps.shape[:4] == (2, 3, 2, 2)

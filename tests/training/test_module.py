@@ -14,11 +14,6 @@ from ugr_lightning.training.module import PolicyModule, check_fit, found_by
 QUIET = {"enable_progress_bar": False, "enable_model_summary": False, "enable_checkpointing": False}
 
 
-class Choosy(TinyPolicy):
-    def check(self, batch):
-        raise ConfigError("demonstrations", "others", "these", "Choose others.")
-
-
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
     """One short training, and its folder."""
@@ -80,14 +75,6 @@ def test_a_nan_loss_stops_training_and_leaves_what_is_needed_to_replay_it(tmp_pa
     assert dump["batch"]["state"].shape[1] == 3
     assert str(int(dump["batch"]["episode"][0])) + ":" in str(caught.value)
     assert (folder / "last.ckpt").is_file(), "the checkpoint of the first epoch is still there"
-
-
-def test_a_policy_that_cannot_learn_from_its_first_batch_says_so_before_the_first_step(tmp_path):
-    policy = Choosy()
-    before = policy.head.weight.detach().clone()
-    with pytest.raises(ConfigError, match="Choose others"):
-        train(tmp_path / "tiny" / "version_0", policy, max_epochs=1)
-    assert torch.equal(policy.head.weight, before)
 
 
 @pytest.mark.parametrize("precision", ["bf16-mixed", "16-mixed"])

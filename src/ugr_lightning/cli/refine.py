@@ -2,7 +2,6 @@
 
 from functools import partial
 from pathlib import Path
-from typing import Literal
 
 from ugr_lightning.cli.import_checkpoint import require_new
 from ugr_lightning.cli.parsing.call import Count, call
@@ -15,7 +14,6 @@ def _refine(
     run: str | None = None,
     root: str = "runs",
     refine: Selector | None = None,
-    refine_branch: Literal["mlp", "reach"] = "mlp",
     data: str = "data/160x120",
     stride: Count = 12,
     out: str | None = None,
@@ -29,8 +27,6 @@ def _refine(
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         refine: which steps are refined: Full, Block, Uncertainty, or a selector of your own; null means every step.
-        refine_branch: `mlp`, or `reach`: towards where the policy sees that each hand will grip next (keyframes, ViperX
-            arms).
         data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
         stride: control steps between two of the chunks that it learns from.
         out: checkpoint to write, which must not exist; null means `<checkpoint>_refined.ckpt` beside the checkpoint,
@@ -53,7 +49,7 @@ def _refine(
     if not isinstance(policy, ACT):
         raise CheckpointError(file, "a policy of the class ACT", type(policy).__name__, "Choose another checkpoint.")
     torch.manual_seed(0)
-    refining = with_refinement(policy, refine or Full(), refine_branch)
+    refining = with_refinement(policy, refine or Full())
     opened = open_data(policy, info.trained_on, data)
     fit_refinement(refining, opened, stride=stride)
     path = Path(out) if out else file.with_name(f"{file.stem}_refined.ckpt")

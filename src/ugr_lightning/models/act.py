@@ -29,7 +29,6 @@ from ugr_lightning.models.losses import (
 )
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.precision import Precision, autocast, full_precision
-from ugr_lightning.models.reach import Reach, require_arms
 from ugr_lightning.models.refine.branch import BranchName, ResidualBranch
 from ugr_lightning.models.refine.selector import Selector
 from ugr_lightning.models.tokens import TokenPolicy
@@ -47,7 +46,6 @@ class Plan(NamedTuple):
         refined: (B, K) bool, m; None where nothing refines.
         sighting: the hands' next keyframes; None where the policy does not look for them.
         hidden: (B, K, D) float32, H_0.
-        reaching: (B, K, A) float32, what the `reach` branch starts from: A_0 with the correction of its `mlp`.
     """
 
     actions: Tensor
@@ -56,21 +54,6 @@ class Plan(NamedTuple):
     refined: Tensor | None
     sighting: Sighting | None
     hidden: Tensor
-    reaching: Tensor
-
-
-class Refined(NamedTuple):
-    """A refined chunk in normalised units.
-
-    Args:
-        actions: (B, K, A) float32, A_1.
-        chosen: (B, K) bool, m; None where nothing refines.
-        reaching: (B, K, A) float32, what the `reach` branch starts from.
-    """
-
-    actions: Tensor
-    chosen: Tensor | None
-    reaching: Tensor
 
 
 class ACT(TokenPolicy):
@@ -80,8 +63,7 @@ class ACT(TokenPolicy):
 
     Args:
         refine: which steps are refined: Full, Block, Uncertainty, a selector of your own, or null for none (`base`).
-        refine_branch: what computes the correction: `mlp` per step, one more `decoder` layer, or `reach`, per step and
-            towards where the tools' next keyframes are seen.
+        refine_branch: what computes the correction: `mlp` per step, or one more `decoder` layer.
         refine_detach_coarse: keep the refinement loss from changing the coarse actions; the paper lets it.
         uncertainty_head: predict a log-variance per step even where `refine` does not ask for it, for analysis.
         causal: let a step attend only to earlier ones in the decoder's self-attention (`cmask`).
@@ -128,7 +110,7 @@ class ACT(TokenPolicy):
     """
 
     not_kept: ClassVar[tuple[str, ...]] = ("backbone_weights",)
-    exact: ClassVar[tuple[str, ...]] = ("action_head", "uncertainty_head", "reach")
+    exact: ClassVar[tuple[str, ...]] = ("action_head", "uncertainty_head")
     only_trained: ClassVar[tuple[str, ...]] = ("posterior",)
 
     def __init__(
@@ -219,23 +201,9 @@ class ACT(TokenPolicy):
         self.action_head = nn.Linear(dim, action_dim)
         self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
         self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
-        reaches = refine is not None and refine_branch == "reach"
-        if reaches and keyframes is None:
-            fix = "Add `--config keyframes/act`, or set `refine_branch: mlp`."
-            raise ConfigError("refine_branch: reach", "a policy that looks for keyframes", "`keyframes: null`", fix)
-        self.reach = Reach(dim) if reaches else None
         self.budget = refine.budget(chunk_length) if refine is not None else None
         if backbone_weights is not None:
             self.backbone.load_weights(backbone_weights)
-
-    def check(self, batch: Batch) -> None:
-        """Refuse the demonstrations of other arms to a branch that knows its own.
-
-        Raises:
-            ConfigError: they are of another robot.
-        """
-        if self.reach is not None and batch.keyframes is not None:
-            require_arms(batch)
 
     def losses(self, batch: Batch) -> dict[str, Tensor]:
         """The terms of the objective; paper, Eq. (6) to (8).
@@ -247,7 +215,7 @@ class ACT(TokenPolicy):
             batch: observations and the chunks that followed.
 
         Returns:
-            Scalars `loss`, `coarse`, and where the policy has them `refine`, `uncertainty`, `kl`, `reach`.
+            Scalars `loss`, `coarse`, and where the policy has them `refine`, `uncertainty`, `kl`.
 
         Raises:
             ConfigError: images of another number of cameras.
@@ -275,10 +243,6 @@ class ACT(TokenPolicy):
             uncertainty_weight=self.uncertainty_weight,
             kl_weight=self.kl_weight,
         )
-        if self.reach is not None and plan.sighting is not None:
-            start, points = self.normalizer.robot_action(plan.reaching.detach()), plan.sighting.points[:, :, 0]
-            terms["reach"] = self.reach.lesson(plan.hidden, start, points, batch.actions, acting)
-            total = total + terms["reach"]
         return self.lesson({"loss": total, **terms}, plan.sighting)
 
     @torch.no_grad()
@@ -334,31 +298,31 @@ class ACT(TokenPolicy):
             coarse = self.action_head(whole)  # (B, K, A), A_0
             if self.uncertainty_head is not None:
                 log_variance = self.uncertainty_head(whole.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
-        points = None if sighting is None else sighting.points[:, :, 0]  # (B, 2, 3), the tools
-        actions, chosen, reaching = self.refined(hidden, coarse, log_variance, points, valid, (memory, memory_keys))
-        return Plan(actions, coarse, log_variance, chosen, sighting, whole, reaching)
+        actions, refined = self.refined(hidden, coarse, log_variance, valid, (memory, memory_keys))
+        return Plan(actions, coarse, log_variance, refined, sighting, whole)
 
     def refined(
         self,
         hidden: Tensor,
         coarse: Tensor,
         log_variance: Tensor | None,
-        points: Tensor | None,
         valid: Tensor,
         memory: tuple[Tensor, Tensor] | None = None,
-    ) -> Refined:
+    ) -> tuple[Tensor, Tensor | None]:
         """A_1 of A_0; paper, Eq. (3) to (5).
 
         Args:
             hidden: (B, K, D), H_0.
             coarse: (B, K, A) float32, A_0, normalised.
             log_variance: (B, K) float32, s; None without an uncertainty head.
-            points: (B, 2, 3) where the tools' next keyframes are seen, m; None without keyframes.
             valid: (B, K) bool, False on padded steps.
             memory: (B, N, D) twice, without and with positions, for the branch `decoder`.
+
+        Returns:
+            (B, K, A) float32, A_1, and (B, K) bool, m; None where nothing refines.
         """
         if self.refine is None or self.branch is None:
-            return Refined(coarse, None, coarse)
+            return coarse, None
         chosen = self.refine.select(None if log_variance is None else log_variance.detach(), valid, self.training)
         start = coarse.detach() if self.refine_detach_coarse else coarse
         with autocast(self.precision, coarse.device):
@@ -366,13 +330,7 @@ class ACT(TokenPolicy):
                 residual = self.branch.at(chosen, self.budget, hidden, start)  # (B, K, A), m * dA
             else:
                 residual = self.branch(hidden, start, self.query_embed, memory)  # (B, K, A), dA
-        reaching = start + residual  # (B, K, A)
-        if self.reach is not None and points is not None:
-            with full_precision(coarse.device):
-                start_robot = self.normalizer.robot_action(reaching)  # (B, K, A)
-                motion = self.reach(hidden.float(), start_robot, points)  # (B, K, A)
-                residual = residual + (motion / self.normalizer.action_scale).detach()  # it has a lesson of its own
-        return Refined(start + chosen[..., None] * residual, chosen, reaching)  # A_1 = A_0 + m * dA
+        return start + chosen[..., None] * residual, chosen  # A_1 = A_0 + m * dA
 
     def _lessons(self, batch: Batch) -> tuple[Tensor, Tensor]:
         """Which steps (B, K) teach the actions, and which the uncertainty; the same, unless episodes are held out."""

@@ -89,12 +89,7 @@ class PolicyModule(LightningModule):
             self.policy.set_statistics(statistics)
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Show the policy the first batch, and count logged steps right.
-
-        Lightning adds one too many when it resumes at an epoch's boundary.
-        """
-        if self.trainer.global_step == 0:
-            self.policy.check(batch)
+        """Count logged steps right: Lightning adds one too many when it resumes at an epoch's boundary."""
         self.trainer.fit_loop.epoch_loop._batches_that_stepped = self.trainer.global_step
 
     def training_step(self, batch: Batch, batch_idx: int) -> Tensor:

@@ -10,8 +10,6 @@ from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.act import ACT
 from ugr_lightning.models.losses import refine_loss
-from ugr_lightning.models.reach import require_arms
-from ugr_lightning.models.refine.branch import BranchName
 from ugr_lightning.models.refine.selector import Selector
 from ugr_lightning.uncertainty.predictions import batches
 
@@ -25,40 +23,34 @@ class Known(NamedTuple):
         hidden: (n, K, D) float16.
         coarse: (n, K, A) normalised.
         log_variance: (n, K); NaN without an uncertainty head.
-        points: (n, 2, 3) where the tools' next keyframes were seen, m; NaN without keyframes.
-        shown: (n, K, A) robot units.
+        target: (n, K, A) demonstrated, normalised.
         valid: (n, K) bool.
     """
 
     hidden: Tensor
     coarse: Tensor
     log_variance: Tensor
-    points: Tensor
-    shown: Tensor
+    target: Tensor
     valid: Tensor
 
 
-def with_refinement(policy: ACT, refine: Selector, branch: BranchName) -> ACT:
+def with_refinement(policy: ACT, refine: Selector) -> ACT:
     """A copy of a policy with another refinement in place of what it has; it has learned nothing yet.
 
     Args:
         policy: a trained one.
-        refine: which steps are to be refined.
-        branch: what computes the corrections, each step's by itself.
+        refine: which steps are to be refined, each by itself.
 
     Raises:
         ConfigError: the policy lacks what the refinement needs.
     """
-    if branch == "decoder":
-        fix = "Train it with everything else: `ugr fit --model.policy.init_args.refine_branch decoder`."
-        raise ConfigError("refine_branch", "mlp or reach", branch, fix)
     foresees = policy.uncertainty_head is not None
     if refine.needs_uncertainty and not foresees:
         fix = "Choose other steps, or train one that foresees them, e.g. `--config uncert`."
         raise ConfigError(f"refine: {type(refine).__name__}", "a policy with an uncertainty head", "none", fix)
     built = policy.blueprint()
-    changed = {"refine": refine.blueprint(), "refine_branch": branch, "uncertainty_head": foresees}
-    unrefined = {k: v for k, v in policy.state_dict().items() if not k.startswith(("branch.", "reach."))}
+    changed = {"refine": refine.blueprint(), "refine_branch": "mlp", "uncertainty_head": foresees}
+    unrefined = {k: v for k, v in policy.state_dict().items() if not k.startswith("branch.")}
     refining: Any = rebuild(built | {"init_args": built["init_args"] | changed})
     refining.load_state_dict(unrefined, strict=False)
     copied: ACT = refining.eval()
@@ -72,15 +64,12 @@ def fit_refinement(policy: ACT, data: ChunkDataModule, *, stride: int) -> None:
         policy: from `with_refinement`.
         data: after `setup`, those of its training.
         stride: control steps between two chunks.
-
-    Raises:
-        ConfigError: the demonstrations have not what the branch learns from.
     """
     assert policy.branch is not None
     known = _known(policy, data, stride)
     policy.requires_grad_(False)
-    parts = [part.requires_grad_(True) for part in (policy.branch, policy.reach) if part is not None]
-    optimizer = torch.optim.AdamW([p for part in parts for p in part.parameters()], RATE, weight_decay=DECAY)
+    policy.branch.requires_grad_(True)
+    optimizer = torch.optim.AdamW(policy.branch.parameters(), RATE, weight_decay=DECAY)
     chance = torch.Generator().manual_seed(0)
     policy.train()
     for step in range(STEPS):
@@ -93,16 +82,10 @@ def fit_refinement(policy: ACT, data: ChunkDataModule, *, stride: int) -> None:
 
 
 def _lesson(policy: ACT, known: Known) -> Tensor:
-    hidden, shown = known.hidden.float(), known.shown
     doubt = None if policy.uncertainty_head is None else known.log_variance
-    done = policy.refined(hidden, known.coarse, doubt, known.points, known.valid)
-    assert done.chosen is not None
-    target = policy.normalizer.action(shown)  # (B, K, A)
-    missed = refine_loss(done.actions, target, done.chosen, known.valid, policy.reconstruction)
-    if policy.reach is not None:
-        start = policy.normalizer.robot_action(done.reaching.detach())
-        missed = missed + policy.reach.lesson(hidden, start, known.points, shown, known.valid)
-    return missed
+    actions, chosen = policy.refined(known.hidden.float(), known.coarse, doubt, known.valid)
+    assert chosen is not None
+    return refine_loss(actions, known.target, chosen, known.valid, policy.reconstruction)
 
 
 def _known(policy: ACT, data: ChunkDataModule, stride: int) -> Known:
@@ -114,15 +97,10 @@ def _known(policy: ACT, data: ChunkDataModule, stride: int) -> Known:
     every = policy.uncertainty_holdout  # of these episodes the actions teach the uncertainty only
     episodes = tuple(episode for episode in data.episode_split.train if not every or episode % every)
     for batch in batches(data, episodes, stride=stride):
-        if policy.reach is not None and batch.keyframes is None:
-            fix = "Give the folder with the recording that the policy was trained on, with --data."
-            raise ConfigError("demonstrations", "keyframes", "none", fix)
-        if policy.reach is not None and not parts:
-            require_arms(batch)
-        chunk, count = policy.predict(batch.observation), len(batch.valid)
-        unknown = batch.actions.new_full((), torch.nan)
-        doubt = unknown.expand(batch.valid.shape) if chunk.log_variance is None else chunk.log_variance
-        points = unknown.expand(count, 2, 3) if chunk.points is None else chunk.points[:, :, 0]
-        parts.append(Known(given["hidden"].half(), given["coarse"], doubt, points, batch.actions, batch.valid))
+        doubt = policy.predict(batch.observation).log_variance
+        if doubt is None:
+            doubt = torch.full(batch.valid.shape, torch.nan)
+        target = policy.normalizer.action(batch.actions)
+        parts.append(Known(given["hidden"].half(), given["coarse"], doubt, target, batch.valid))
     hook.remove()
     return Known(*(torch.cat(column) for column in zip(*parts, strict=True)))

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from ugr_lightning.models.transformer import DecoderLayer
 
-BranchName = Literal["mlp", "decoder", "reach"]
+BranchName = Literal["mlp", "decoder"]
 
 
 class ResidualBranch(nn.Module):
@@ -16,7 +16,7 @@ class ResidualBranch(nn.Module):
     Its last layer starts at zero, so that training starts at the coarse policy.
 
     Args:
-        kind: `mlp` corrects each step by itself, also beside `reach`; `decoder` is one more decoder layer with
+        kind: `mlp` corrects each step by itself; `decoder` is one more decoder layer with
             cross-attention to the shared memory.
         dim, heads, feedforward, dropout: sizes of the trunk.
         action_dim: A.
