@@ -7,7 +7,7 @@ import torch
 from deployed import looking_act
 from lightning.pytorch import Trainer
 from tiny import TinyPolicy
-from torch.optim import AdamW, Muon
+from torch.optim import AdamW
 from torch.optim.lr_scheduler import LambdaLR
 
 from ugr_lightning.errors import ConfigError
@@ -80,7 +80,10 @@ def test_the_module_gives_muon_its_own_rate():
 def test_both_together_do_what_each_does_alone():
     ours, theirs = some(), some()
     together = joined(ours)
-    alone = Muon(theirs[:2], RATE, 0.1, adjust_lr_fn="match_rms_adamw"), AdamW(theirs[2:], 1e-2, weight_decay=0.1)
+    alone = (
+        torch.optim.Muon(theirs[:2], RATE, 0.1, adjust_lr_fn="match_rms_adamw"),
+        AdamW(theirs[2:], 1e-2, weight_decay=0.1),
+    )
     for step in range(5):
         give_gradients(ours, step)
         give_gradients(theirs, step)
