@@ -45,7 +45,6 @@ class Plan(NamedTuple):
         log_variance: (B, K) float32, s; None without an uncertainty head.
         refined: (B, K) bool, m; None where nothing refines.
         sighting: the hands' next keyframes; None where the policy does not look for them.
-        hidden: (B, K, D) float32, H_0.
     """
 
     actions: Tensor
@@ -53,7 +52,6 @@ class Plan(NamedTuple):
     log_variance: Tensor | None
     refined: Tensor | None
     sighting: Sighting | None
-    hidden: Tensor
 
 
 class ACT(TokenPolicy):
@@ -299,7 +297,7 @@ class ACT(TokenPolicy):
             if self.uncertainty_head is not None:
                 log_variance = self.uncertainty_head(whole.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
         actions, refined = self.refined(hidden, coarse, log_variance, valid, (memory, memory_keys))
-        return Plan(actions, coarse, log_variance, refined, sighting, whole)
+        return Plan(actions, coarse, log_variance, refined, sighting)
 
     def refined(
         self,
