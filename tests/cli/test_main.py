@@ -69,7 +69,7 @@ import ugr_lightning.cli.fit, ugr_lightning.cli.rollout, ugr_lightning.training.
 SLOW = {"torch", "lightning", "scipy", "matplotlib", "h5py", "PIL", "diffusers", "tensorboard"}
 SLOW |= {"sapien", "mani_skill", "gymnasium", "imageio", "rerun", "pyarrow", "onnx", "transformers"}
 TRAINING = {"torch", "lightning", "scipy", "matplotlib", "PIL", "h5py"}  # Lightning itself brings the first five
-MAY_LOAD = {"doctor": {"torch"}, "import-act": {"torch"}, "import-lerobot": {"torch"}}
+MAY_LOAD = {"doctor": {"torch"}, "import-act": {"torch"}, "import-lerobot": {"torch"}, "refine": {"torch"}}
 MAY_LOAD |= {"fit": TRAINING, "validate": TRAINING}
 PARTS = ("tasks list", "tasks measure", "data inspect", "data convert", "bridge robotwin", "bridge serve")
 LINES = ["tasks", *(f"{line} --help" for line in (*COMMANDS, *PARTS))]

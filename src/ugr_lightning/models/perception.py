@@ -191,7 +191,8 @@ class PicturePolicy(ChunkPolicy):
         if projection is None:
             raise missing_keyframes("observations without calibrated cameras")
         first, second, third, _ = looked.stages
-        grips = self.normalizer.state(state)[:, last_of_each_arm(state.shape[1])]  # (B, 2)
+        joints = self.normalizer.state(state)  # (B, S)
+        grips = torch.stack([joints[:, place] for place in last_of_each_arm(state.shape[1])], 1)  # (B, 2)
         sighting: Sighting = self.finder((first, second, third), projection, looked.shift, grips, labels)
         return sighting
 
