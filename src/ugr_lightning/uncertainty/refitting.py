@@ -67,8 +67,6 @@ def fit_refinement(policy: ACT, data: ChunkDataModule, *, stride: int) -> None:
     """
     assert policy.branch is not None
     known = _known(policy, data, stride)
-    policy.requires_grad_(False)
-    policy.branch.requires_grad_(True)
     optimizer = torch.optim.AdamW(policy.branch.parameters(), RATE, weight_decay=DECAY)
     chance = torch.Generator().manual_seed(0)
     policy.train()
