@@ -15,7 +15,6 @@ from ugr_lightning.models.checkpoint import load_policy
 from ugr_lightning.models.refine.full import Full
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.sim.kinematics import HOME, SIDES, forward, to_world
-from ugr_lightning.uncertainty.refitting import with_refinement
 from ugr_lightning.uncertainty import refitting
 from ugr_lightning.uncertainty.predictions import batches
 
@@ -62,7 +61,7 @@ def test_a_policy_learns_to_refine_and_keeps_everything_else(demonstrations, unt
 def test_a_former_refinement_is_forgotten():
     policy = looking_act(refine=Uncertainty())
     torch.nn.init.normal_(policy.branch.head.weight)
-    assert not with_refinement(policy, Full()).branch.head.weight.any()
+    assert not refitting.with_refinement(policy, Full()).branch.head.weight.any()
 
 
 def test_which_steps_are_refined_is_a_choice(demonstrations, untrained, tmp_path, capsys):
