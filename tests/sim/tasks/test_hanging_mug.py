@@ -106,7 +106,7 @@ def test_the_mug_comes_astray_before_the_peg_and_is_in_line_with_it_once_it_gets
         beside.setdefault(step.phase, []).append(np.linalg.norm(opening - along * environment.peg_direction))
         if step.phase == "insert" and along < PEG_LENGTH:
             break
-    assert beside["align"][0] > 0.8 * abs(environment.beside[0]) > 0.01
+    assert beside["align"][0] > 0.6 * abs(environment.beside[0]) > 0.01
     assert beside["insert"][-1] < 0.004
 
 
