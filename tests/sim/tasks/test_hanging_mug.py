@@ -6,7 +6,6 @@ from ugr_lightning.sim.kinematics import rotation_y, rotation_z
 from ugr_lightning.sim.objects import pose_of
 from ugr_lightning.sim.sapien_simulator import SapienSimulator
 from ugr_lightning.sim.tasks.hanging_mug import (
-    ASTRAY,
     HANDLE_REACH,
     MEETING_POINT,
     MUG_HEIGHT,
@@ -95,21 +94,6 @@ def test_noise_does_not_knock_the_mug_over_before_the_right_hand_has_it(mug, see
     assert mug._env.mug_pose().rotation[2, 2] > np.cos(np.radians(5))
 
 
-def test_the_mug_comes_astray_before_the_peg_and_is_in_line_with_it_once_it_gets_there(mug):
-    mug.reset(5)
-    environment, beside = mug._env, {}
-    for step in mug.expert():
-        mug.step(step.action)
-        origin, rotation = environment.mug_pose()
-        opening = origin + rotation @ environment.opening_middle - environment.peg_root
-        along = opening @ environment.peg_direction
-        beside.setdefault(step.phase, []).append(np.linalg.norm(opening - along * environment.peg_direction))
-        if step.phase == "insert" and along < PEG_LENGTH:
-            break
-    assert beside["align"][0] > 0.6 * abs(environment.beside[0]) > 0.01
-    assert beside["insert"][-1] < 0.004
-
-
 def test_mugs_and_racks_vary_within_their_ranges(mug):
     rows, colours = [], set()
     for seed in range(12):
@@ -124,20 +108,17 @@ def test_mugs_and_racks_vary_within_their_ranges(mug):
     assert len(colours) >= 3
 
 
-def test_the_expert_sets_the_mug_down_and_comes_to_the_peg_elsewhere_in_every_scene(mug):
-    places, astray = [], []
+def test_the_expert_sets_the_mug_down_beside_the_meeting_point_elsewhere_in_every_scene(mug):
+    places = []
     for seed in range(12):
         mug.reset(seed)
         position, rotation = mug._env.put_down
         away = position - MEETING_POINT
         turn = np.arctan2(-rotation[1, 0], -rotation[0, 0])
         places.append([*away[:2], turn])
-        astray.append([*mug._env.beside, mug._env.askew])
         assert away[2] == 0.0
     assert (np.abs(places) <= PUT_DOWN).all()
     assert (np.ptp(places, axis=0) > PUT_DOWN).all()
-    assert (np.abs(astray) <= ASTRAY).all()
-    assert (np.ptp(astray, axis=0) > ASTRAY).all()
 
 
 def test_the_scene_of_a_seed_is_the_one_it_was_in_version_1(mug):

@@ -42,8 +42,6 @@ MEETING_POINT = np.array([0.0, -0.12, 0.0])
 PUT_DOWN = np.array([0.02, 0.02, 0.2])  # m, m, rad: up to this far from there, as a policy does, and not always on it
 GRASP = 0.6  # fraction of the mug's height
 BEYOND = 0.06  # how far in front of the peg the handle waits
-ASTRAY = np.array([0.03, 0.015, 0.01, 0.2])  # m, m, m, rad: up to this far beside it at first, as a policy is, so that
-# demonstrations show how to come from there to where it has to wait by what the wrist camera sees of the peg
 REST = 0.002  # commanded below the height at which the handle touches the peg
 
 
@@ -74,7 +72,6 @@ class HangingMug(TwoArmEnv):
         self.peg_root = np.array([rack_x, rack_y, PEG_HEIGHT])
         x, y, turn = PUT_DOWN * rng.uniform(-1.0, 1.0, 3)  # drawn last: scenes do not depend on it
         self.put_down = TcpPose(MEETING_POINT + np.array([x, y, 0.0]), rotation_z(np.pi + turn))
-        *self.beside, self.askew = ASTRAY * rng.uniform(-1.0, 1.0, 4)
         self._rack().build("rack", pose_of((rack_x, rack_y, 0.0), turned), static=True)
 
     def _mug(self, colour: Colour) -> Prop:
@@ -170,13 +167,10 @@ class HangingMug(TwoArmEnv):
         yield from arms.move({"right": lifted}, steps=22, phase="lift-right", slack=(0.1, 0.0, 1.0), overlap=8)
 
     def _hang(self, arms: Arms) -> Iterator[ExpertStep]:
-        before = self._hanging(PEG_LENGTH + BEYOND, turn=self.askew)
-        astray = TcpPose(before.position + np.array(self.beside), before.rotation)
-        yield from arms.move({"right": astray}, steps=46, phase="tip", slack=(1.0, 1.0, 0.8, 0.4), overlap=6)
         before = self._hanging(PEG_LENGTH + BEYOND)
-        yield from arms.move({"right": before}, steps=26, phase="align", slack=(0.4, 0.3, 0.2), overlap=6)
+        yield from arms.move({"right": before}, steps=46, phase="tip", slack=(1.0, 1.0, 0.8, 0.4), overlap=6)
         yield from arms.move(
-            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.2, 0.2, 0.1)
+            {"right": self._hanging(PEG_LENGTH / 2.0)}, steps=36, phase="insert", slack=(0.4, 0.2, 0.1)
         )
         drop = self.reach / 2.0 - TUBE - PEG_RADIUS + REST
         yield from arms.move({"right": self._hanging(PEG_LENGTH / 2.0, drop)}, steps=12, phase="rest", slack=(0.1, 0.0))
@@ -192,13 +186,10 @@ class HangingMug(TwoArmEnv):
         yaw = facing(side) + (backwards - facing(side) + np.pi) % (2.0 * np.pi) - np.pi
         return TcpPose(origin + GRASP * self.height * UP, gripper_down(yaw))
 
-    def _hanging(self, along: float, below: float = 0.0, turn: float = 0.0) -> TcpPose:
-        """Right tool pose that holds the mug on its side: `along` metres from the peg's root, `below` its line.
-
-        Turned about the vertical by `turn`, the opening stays where it is.
-        """
+    def _hanging(self, along: float, below: float = 0.0) -> TcpPose:
+        """Right tool pose that holds the mug on its side: `along` metres from the peg's root, `below` its line."""
         rotation = (
-            rotation_z(self.rack[2] + turn) @ rotation_y(np.pi / 2.0) @ rotation_z(np.pi)
+            rotation_z(self.rack[2]) @ rotation_y(np.pi / 2.0) @ rotation_z(np.pi)
         )  # handle up, bottom to the left
         middle = self.peg_root + along * self.peg_direction - below * UP
         return self._carrying("right", middle - rotation @ self.opening_middle, rotation)
