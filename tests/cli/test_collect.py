@@ -1,8 +1,15 @@
+import json
+import warnings
 from pathlib import Path
 
+import pytest
+
+from ugr_lightning.cli.collect import remark_on_older_recordings
 from ugr_lightning.cli.main import main
+from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.demos.noise import Noise
-from ugr_lightning.sim.tasks import task_names
+from ugr_lightning.errors import DataError
+from ugr_lightning.sim.tasks import task_names, task_version
 
 
 def test_collect_hands_its_options_on(monkeypatch, capsys):
@@ -45,3 +52,30 @@ def test_collect_says_what_a_shard_leaves_to_be_done(monkeypatch, capsys):
     first, *others = capsys.readouterr().out.splitlines()
     assert "--shard 1/1 completes" in first
     assert others[0] == others[1]
+
+
+@pytest.fixture
+def recorded(tmp_path):
+    """A data module over a folder that says to be of some version of the mug, and that folder."""
+    folder = tmp_path / "hanging_mug" / "demo_clean"
+    folder.mkdir(parents=True)
+
+    def of_version(content, **more):
+        (folder / "recording.json").write_text(content)
+        return ChunkDataModule(task="hanging_mug", root=str(tmp_path), **more)
+
+    return of_version, folder
+
+
+def test_a_training_warns_of_recordings_of_another_version_of_its_task(recorded):
+    of_version, folder = recorded
+    now = task_version("hanging_mug")
+    with pytest.warns(UserWarning, match=f"version {now - 1} of hanging_mug; here it is version {now}. Move"):
+        remark_on_older_recordings(of_version(json.dumps({"task_version": now - 1})))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        remark_on_older_recordings(of_version(json.dumps({"task_version": now})))
+        remark_on_older_recordings(of_version("{}"))  # a recording from before versions
+        remark_on_older_recordings(of_version(json.dumps({"task_version": now - 1}), folder=str(folder)))
+    with pytest.raises(DataError, match="settings of a recording"):
+        remark_on_older_recordings(of_version("{"))

@@ -1,5 +1,7 @@
 """`ugr collect`: demonstrations of the scripted experts; `ugr fit` records through it what a training lacks."""
 
+import json
+import warnings
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,6 +9,8 @@ from typing import TYPE_CHECKING
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.cli.parsing.shard import every_nth
 from ugr_lightning.demos.noise import Noise
+from ugr_lightning.errors import DataError
+from ugr_lightning.sim.tasks import all_task_names, task_version
 
 if TYPE_CHECKING:
     from ugr_lightning.data.datamodule import ChunkDataModule
@@ -88,3 +92,27 @@ def record_demonstrations(data: "ChunkDataModule") -> None:
         noise=Noise(recording.noise_std, recording.noise_time_constant, recording.noise_bias),
         workers=recording.workers,
     )
+
+
+def remark_on_older_recordings(data: "ChunkDataModule") -> None:
+    """Warn where the data module's folder was recorded with another version of its task than the simulator's.
+
+    Args:
+        data: its `task` and `folder`; one that records nothing (`data.folder` is given) is left alone.
+
+    Raises:
+        DataError: the recording's settings cannot be read.
+    """
+    path = data.folder / "recording.json"
+    if data.elsewhere or data.task not in all_task_names() or not path.is_file():
+        return
+    try:
+        recorded = json.loads(path.read_text()).get("task_version")
+    except (ValueError, AttributeError) as error:
+        raise DataError(path, "the settings of a recording", error, "Restore the file.") from error
+    if recorded not in (None, task_version(data.task)):
+        warnings.warn(
+            f"{data.folder} was recorded with version {recorded} of {data.task}; here it is version "
+            f"{task_version(data.task)}. Move the folder away to record anew.",
+            stacklevel=2,
+        )
