@@ -4,9 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from ugr_lightning.cli.collect import remark_on_older_recordings
+from ugr_lightning.cli.collect import check_recording
 from ugr_lightning.cli.main import main
-from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.data.datamodule import ChunkDataModule, Recording
 from ugr_lightning.demos.noise import Noise
 from ugr_lightning.errors import DataError
 from ugr_lightning.sim.tasks import task_names, task_version
@@ -56,26 +56,41 @@ def test_collect_says_what_a_shard_leaves_to_be_done(monkeypatch, capsys):
 
 @pytest.fixture
 def recorded(tmp_path):
-    """A data module over a folder that says to be of some version of the mug, and that folder."""
+    """A data module over a folder of the mug that says how it was recorded, and that folder."""
     folder = tmp_path / "hanging_mug" / "demo_clean"
     folder.mkdir(parents=True)
 
-    def of_version(content, **more):
+    def recorded_as(content, **more):
         (folder / "recording.json").write_text(content)
         return ChunkDataModule(task="hanging_mug", root=str(tmp_path), **more)
 
-    return of_version, folder
+    return recorded_as, folder
 
 
 def test_a_training_warns_of_recordings_of_another_version_of_its_task(recorded):
-    of_version, folder = recorded
+    recorded_as, folder = recorded
     now = task_version("hanging_mug")
     with pytest.warns(UserWarning, match=f"version {now - 1} of hanging_mug; here it is version {now}. Move"):
-        remark_on_older_recordings(of_version(json.dumps({"task_version": now - 1})))
+        check_recording(recorded_as(json.dumps({"task_version": now - 1})))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        remark_on_older_recordings(of_version(json.dumps({"task_version": now})))
-        remark_on_older_recordings(of_version("{}"))  # a recording from before versions
-        remark_on_older_recordings(of_version(json.dumps({"task_version": now - 1}), folder=str(folder)))
+        check_recording(recorded_as(json.dumps({"task_version": now})))
+        check_recording(recorded_as("{}"))  # a recording from before versions
+        check_recording(recorded_as(json.dumps({"task_version": now - 1}), folder=str(folder)))
     with pytest.raises(DataError, match="settings of a recording"):
-        remark_on_older_recordings(of_version("{"))
+        check_recording(recorded_as("{"))
+
+
+def test_a_training_refuses_recordings_that_were_made_in_another_way_than_it_asks_for(recorded):
+    recorded_as, folder = recorded
+    small = json.dumps({"image_size": [60, 80], "noise": {"std": 0.0, "time_constant": 0.5, "attempts": 5}})
+    for asked, said in ((Recording(noise_std=0.02), "noise_std 0.02"), (Recording(image_size=(30, 40)), "[30, 40]")):
+        with pytest.raises(DataError) as refused:
+            check_recording(recorded_as(small, recording=asked))
+        assert said in refused.value.expected
+        check_recording(recorded_as(small, recording=asked, folder=str(folder)))
+    with pytest.warns(UserWarning, match=r"noise_std 0.0, image_size \[60, 80\], not with the defaults"):
+        check_recording(recorded_as(small))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_recording(recorded_as(small, recording=Recording(noise_std=0.0, image_size=(60, 80))))

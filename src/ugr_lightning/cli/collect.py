@@ -2,6 +2,7 @@
 
 import json
 import warnings
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -94,25 +95,41 @@ def record_demonstrations(data: "ChunkDataModule") -> None:
     )
 
 
-def remark_on_older_recordings(data: "ChunkDataModule") -> None:
-    """Warn where the data module's folder was recorded with another version of its task than the simulator's.
+def check_recording(data: "ChunkDataModule") -> None:
+    """Make sure that the data module's folder was recorded as its `recording` says.
+
+    What nobody asked for is only remarked on: a default that the folder does not have, or a newer version of the task.
 
     Args:
-        data: its `task` and `folder`; one that records nothing (`data.folder` is given) is left alone.
+        data: its `task`, `folder` and `recording`; one that records nothing (`data.folder` is given) is left alone.
 
     Raises:
-        DataError: the recording's settings cannot be read.
+        DataError: the folder was recorded with something else than asked for, or its settings cannot be read.
     """
     path = data.folder / "recording.json"
-    if data.elsewhere or data.task not in all_task_names() or not path.is_file():
+    if data.elsewhere or not path.is_file():
         return
     try:
-        recorded = json.loads(path.read_text()).get("task_version")
+        found = json.loads(path.read_text())
+        noise = {f"noise_{name}": value for name, value in found.get("noise", {}).items()}
+        version, recorded = found.get("task_version"), {"image_size": found.get("image_size"), **noise}
     except (ValueError, AttributeError) as error:
         raise DataError(path, "the settings of a recording", error, "Restore the file.") from error
-    if recorded not in (None, task_version(data.task)):
-        warnings.warn(
-            f"{data.folder} was recorded with version {recorded} of {data.task}; here it is version "
-            f"{task_version(data.task)}. Move the folder away to record anew.",
-            stacklevel=2,
+    asked, usual = (json.loads(json.dumps(asdict(one))) for one in (data.recording, type(data.recording)()))
+    differing = [name for name, value in asked.items() if recorded.get(name) not in (None, value)]
+    meant = [name for name in differing if asked[name] != usual[name]]
+    if meant:
+        expected, got = (", ".join(f"{name} {of[name]}" for name in meant) for of in (asked, recorded))
+        fix = "Record into another folder (`data.root`), move this one away, or ask for what it has."
+        raise DataError(data.folder, f"a recording with `data.recording` {expected}", got, fix)
+    if differing:
+        got = ", ".join(f"{name} {recorded[name]}" for name in differing)
+        _remark(f"{data.folder} was recorded with {got}, not with the defaults of `data.recording`.")
+    if data.task in all_task_names() and version not in (None, task_version(data.task)):
+        _remark(
+            f"{data.folder} was recorded with version {version} of {data.task}; here it is version "
+            f"{task_version(data.task)}. Move the folder away to record anew."
         )
+
+
+_remark = partial(warnings.warn, stacklevel=2)

@@ -278,10 +278,10 @@ class UGRCLI(LightningCLI):
 
     def after_instantiate_classes(self) -> None:
         """Let the data module record what is missing, with the simulator's help."""
-        from ugr_lightning.cli.collect import record_demonstrations, remark_on_older_recordings
+        from ugr_lightning.cli.collect import check_recording, record_demonstrations
 
         self.datamodule.recorder = record_demonstrations
-        remark_on_older_recordings(self.datamodule)
+        check_recording(self.datamodule)
 
 
 def _is_first_process() -> bool:
