@@ -6,7 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from folders import files_of
 from PIL import Image
+from recordings import record
 from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
@@ -72,6 +74,28 @@ def test_the_folder_of_the_task_may_be_given_in_place_of_the_one_of_all_recordin
         assert main([*command[:-1], str(data), "--pictures", "0", "--out", str(tmp_path / "out")]) == 0
         numbers.append(json.loads((tmp_path / "out" / "predictions.json").read_text())["errors"])
     assert numbers[0] == numbers[1]
+
+
+@pytest.mark.parametrize("name", ["predict", "analyze", "refine"])
+def test_demonstrations_of_another_task_with_the_same_names_and_seeds_are_none_of_the_checkpoint(
+    name, ten_demonstrations, tmp_path, tiny_act, untrained, capsys
+):
+    own = ten_demonstrations / "click_alarmclock" / "demo_clean"
+    untrained(tiny_act(), tmp_path, {"folder": str(own)})
+    other = record(tmp_path / "other", 10, steps=12, longer=0, size=(8, 12), task="handover_block", first_draw=50)
+    before = files_of(tmp_path)
+    assert main([name, str(tmp_path / "policy_best.ckpt"), "--data", str(other)]) == 2
+    assert "the episodes of the checkpoint's split, got others" in " ".join(capsys.readouterr().err.split())
+    assert files_of(tmp_path) == before
+
+
+def test_a_policy_that_was_told_the_statistics_of_all_episodes_finds_its_own_again(
+    ten_demonstrations, tmp_path, untrained
+):
+    chosen = {"root": str(ten_demonstrations), "normalise_over": "all"}
+    untrained(TinyPolicy(cameras=CAMERAS, dim=14), tmp_path, chosen)
+    command = ["predict", str(tmp_path / "policy_best.ckpt"), "--data", str(ten_demonstrations), "--pictures", "0"]
+    assert main(command) == 0
 
 
 def test_a_policy_that_sees_a_history_is_followed_too(ten_demonstrations, tmp_path, untrained, capsys):

@@ -1,5 +1,6 @@
 """What a trained policy predicts on the demonstrations it was, and was not, trained on."""
 
+import copy
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ from ugr_lightning.contract import Batch, ChunkPolicy
 from ugr_lightning.data.chunks import AfterEnd
 from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
+from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.errors import DataError
 from ugr_lightning.models.checkpoint import TrainingData
 
@@ -141,7 +143,19 @@ def open_data(
         layout=Layout.of(trained["layout"]) if "layout" in trained else DEFAULT_LAYOUT,
     )
     data.setup()
-    if data.split != trained["split"]:
+    if data.split != trained["split"] or not _trained_with(policy, data):
         fix = "Give the folder with the recording that the policy was trained on, with --data."
-        raise DataError(data.folder, "the episodes and seeds of the checkpoint's split", "others", fix)
+        raise DataError(data.folder, "the episodes of the checkpoint's split", "others", fix)
     return data
+
+
+def _trained_with(policy: ChunkPolicy, data: ChunkDataModule) -> bool:
+    """Whether a policy has the statistics of the data; other tasks have episodes of the same names and seeds."""
+    kept = policy.state_dict()
+    everything = compute_statistics(data.demonstrations, state=data.state)  # `normalise_over: all`
+    for statistics in (data.statistics, everything):
+        told = copy.deepcopy(policy)
+        told.set_statistics(statistics)
+        if all(torch.allclose(kept[name], value, 1e-4, 1e-5, equal_nan=True) for name, value in told.state_dict().items()):
+            return True
+    return False
