@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Literal
 
 from ugr_lightning.cli.parsing.call import Count, call
+from ugr_lightning.cli.parsing.data import OWN, open_own
 from ugr_lightning.errors import ConfigError
 
 
@@ -12,7 +13,7 @@ def _analyze(
     checkpoint: str = "best",
     run: str | None = None,
     root: str = "runs",
-    data: str = "data/160x120",
+    data: str = OWN,
     stride: Count = 5,
     after_end: Literal["mask", "hold"] | None = None,
     resamples: Count = 500,
@@ -30,7 +31,8 @@ def _analyze(
         checkpoint: `best`, `best_loss`, `last`, or a checkpoint file.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
-        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
+        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one;
+            `own` is what `config.yaml` beside the checkpoint names.
         stride: control steps between two queries.
         after_end: count steps past the end of an episode (`hold`) or not (`mask`); null does as the training did.
         resamples: draws of the bootstrap over episodes.
@@ -46,7 +48,6 @@ def _analyze(
     from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.training.runs import resolve_checkpoint
     from ugr_lightning.uncertainty import study as kit
-    from ugr_lightning.uncertainty.predictions import open_data
 
     file = resolve_checkpoint(checkpoint, run, root)
     policy, info = load_policy(file)
@@ -55,7 +56,7 @@ def _analyze(
     for option, chosen in (("--estimators", estimators), ("--residuals", residuals)):
         if chosen and not isinstance(policy, ACT):
             raise ConfigError(option, "a policy of the class ACT", type(policy).__name__, "Leave it out.")
-    opened = open_data(policy, info.trained_on, data, after_end)
+    opened = open_own(policy, info, data, after_end)
     described = {"file": str(file), "sha256": info.sha256, "task": opened.task}
     study = kit.begin_study(policy, opened, described, stride=stride, resamples=resamples)
     if budgets:

@@ -4,6 +4,7 @@ from functools import partial
 from pathlib import Path
 
 from ugr_lightning.cli.parsing.call import Count, CountOrZero, call
+from ugr_lightning.cli.parsing.data import OWN, open_own
 from ugr_lightning.errors import ConfigError
 
 
@@ -11,7 +12,7 @@ def _predict(
     checkpoint: str = "best",
     run: str | None = None,
     root: str = "runs",
-    data: str = "data/160x120",
+    data: str = OWN,
     episodes: Count = 10,
     tasks: str | list[str] | None = None,
     stride: Count = 5,
@@ -26,7 +27,8 @@ def _predict(
         checkpoint: `best`, `best_loss`, `last`, or a checkpoint file.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
-        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
+        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one;
+            `own` is what `config.yaml` beside the checkpoint names.
         episodes: how many training and how many validation episodes, at most; the first of its own split.
         tasks: only episodes of these tasks, by name or by pattern (`click_*`), of a policy that was trained on several.
         stride: control steps between two queries.
@@ -37,12 +39,11 @@ def _predict(
     from ugr_lightning.results.tables import as_text
     from ugr_lightning.training.runs import resolve_checkpoint
     from ugr_lightning.uncertainty import open_loop as kit
-    from ugr_lightning.uncertainty.predictions import open_data
     from ugr_lightning.uncertainty.study import write_page
 
     file = resolve_checkpoint(checkpoint, run, root)
     policy, info = load_policy(file)
-    opened = open_data(policy, info.trained_on, data)
+    opened = open_own(policy, info, data)
     fast, split = policy.for_inference(), opened.episode_split
     meant = opened.positions_of(tasks or ())
     chosen_of = {"training": split.train, "validation": split.validation}

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from ugr_lightning.cli.import_checkpoint import require_new
 from ugr_lightning.cli.parsing.call import Count, call
+from ugr_lightning.cli.parsing.data import OWN, open_own
 from ugr_lightning.errors import CheckpointError
 from ugr_lightning.models.refine.selector import Selector
 
@@ -14,7 +15,7 @@ def _refine(
     run: str | None = None,
     root: str = "runs",
     refine: Selector | None = None,
-    data: str = "data/160x120",
+    data: str = OWN,
     stride: Count = 12,
     out: str | None = None,
 ) -> int:
@@ -27,7 +28,8 @@ def _refine(
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         refine: which steps are refined: Full, Block, Uncertainty, or a selector of your own; null means every step.
-        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one.
+        data: folder of the recordings that the policy was trained on, `data.root`, or `data.folder` if it had one;
+            `own` is what `config.yaml` beside the checkpoint names.
         stride: control steps between two of the chunks that it learns from.
         out: checkpoint to write, which must not exist; null means `<checkpoint>_refined.ckpt` beside the checkpoint,
             in place of an earlier one.
@@ -39,7 +41,7 @@ def _refine(
     from ugr_lightning.models.refine.full import Full
     from ugr_lightning.training.keyframe_error import event_errors, known_kinematics
     from ugr_lightning.training.runs import resolve_checkpoint
-    from ugr_lightning.uncertainty.predictions import batches, open_data
+    from ugr_lightning.uncertainty.predictions import batches
     from ugr_lightning.uncertainty.refitting import fit_refinement, with_refinement
 
     if out:
@@ -50,7 +52,7 @@ def _refine(
         raise CheckpointError(file, "a policy of the class ACT", type(policy).__name__, "Choose another checkpoint.")
     torch.manual_seed(0)
     refining = with_refinement(policy, refine or Full())
-    opened = open_data(policy, info.trained_on, data)
+    opened = open_own(policy, info, data)
     fit_refinement(refining, opened, stride=stride)
     path = Path(out) if out else file.with_name(f"{file.stem}_refined.ckpt")
     save_policy(path, refining, dict(info.data), {"global_step": info.step, "epoch": info.epoch})

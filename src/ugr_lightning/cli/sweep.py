@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from ugr_lightning.cli.parsing.call import Count, call
+from ugr_lightning.cli.parsing.data import OWN, open_own
 from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.cli.rollout import ExecutionName, both_executions
 from ugr_lightning.errors import ConfigError
@@ -27,7 +28,7 @@ def _sweep(
     episodes: Count = 100,
     ratios: list[float] | None = None,
     executions: list[ExecutionName] | None = None,
-    data: str | None = "data/160x120",
+    data: str | None = OWN,
     stride: Count = 5,
     workers: int = 2,
     device: str = "auto",
@@ -47,7 +48,7 @@ def _sweep(
         executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk;
             budgets are compared in the first, the others with it. Null means all that the policy can, 25 steps of them.
         data: folder of the recordings that the policy was trained on (`data.root`, or `data.folder` if it had one),
-            for the offline error; null leaves it out.
+            for the offline error; `own` is what `config.yaml` beside the checkpoint names, null leaves the error out.
         stride: control steps between two queries of the offline error.
         workers: simulator processes.
         device: where the policy computes in closed loop: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
@@ -127,9 +128,9 @@ def _offline(plan: SweepPlan, data: str, stride: int) -> list[Any]:
     """The error of each budget on the validation episodes."""
     from ugr_lightning.models.refine.budget import with_refine_ratio
     from ugr_lightning.uncertainty.budgets import budget_errors
-    from ugr_lightning.uncertainty.predictions import open_data, predict
+    from ugr_lightning.uncertainty.predictions import predict
 
-    opened = open_data(plan.policy, plan.info.trained_on, data)
+    opened = open_own(plan.policy, plan.info, data)
     whole = with_refine_ratio(plan.policy, 1.0).for_inference()
     everything = predict(whole, opened, opened.episode_split.validation, stride=stride)
     return budget_errors(plan.policy, everything, plan.ratios)

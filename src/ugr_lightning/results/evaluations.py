@@ -4,6 +4,7 @@ import json
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -124,23 +125,21 @@ def read_labelled(label: str, path: str | Path) -> Evaluation:
     if len(actors) != 1:
         got = f"{len(actors)}: " + ", ".join(sorted(f"{name} {(sha or '')[:8]}".strip() for name, sha in actors))
         raise DataError(path, "episodes of one policy", got, "Write one file per checkpoint with `ugr test --out`.")
-    return Evaluation(label, _training_seed(path.with_name("config.yaml")), path, results)
+    seed = run_config(path.with_name("config.yaml")).get("seed_everything")
+    return Evaluation(label, seed if isinstance(seed, int) else None, path, results)
 
 
-def _training_seed(config: Path) -> int | None:
-    """The seed that a run's config names; None where there is none.
+def run_config(path: Path) -> dict[str, Any]:
+    """What the `config.yaml` of a run says; empty where there is none.
 
     Raises:
         DataError: a file that is damaged.
     """
-    if not config.is_file():
-        return None
     try:
-        seed = dict(yaml.safe_load(config.read_text()) or {}).get("seed_everything")
+        return dict(yaml.safe_load(path.read_text()) or {}) if path.is_file() else {}
     except (yaml.YAMLError, ValueError, TypeError) as error:
-        fix = "Restore it, or move the results elsewhere."
-        raise DataError(config, "the config of a run", " ".join(str(error).split())[:200], fix) from error
-    return seed if isinstance(seed, int) else None
+        fix = "Restore it, or move it away."
+        raise DataError(path, "the config of a run", " ".join(str(error).split())[:200], fix) from error
 
 
 def _once(path: Path, results: Iterable[EpisodeResult]) -> list[EpisodeResult]:

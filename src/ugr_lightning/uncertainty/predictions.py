@@ -156,6 +156,7 @@ def _trained_with(policy: ChunkPolicy, data: ChunkDataModule) -> bool:
     for statistics in (data.statistics, everything):
         told = copy.deepcopy(policy)
         told.set_statistics(statistics)
-        if all(torch.allclose(kept[name], value, 1e-4, 1e-5, equal_nan=True) for name, value in told.state_dict().items()):
+        pairs = [(kept[name], value) for name, value in told.state_dict().items()]
+        if all(torch.allclose(one, other, 1e-4, 1e-5, equal_nan=True) for one, other in pairs):
             return True
     return False
