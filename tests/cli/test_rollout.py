@@ -55,6 +55,23 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
     assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
 
 
+def test_each_checkpoint_of_a_run_has_results_of_its_own_that_can_be_reported(
+    world, checkpoint, ten_demonstrations, capsys
+):
+    assert main(["refine", str(checkpoint), "--data", str(ten_demonstrations)]) == 0
+    refined = checkpoint.with_name("policy_best_refined.ckpt")
+    few = ["--episodes", "2", "--executions", "[aggregate]"]
+    for file, results in ((checkpoint, "evaluation.jsonl"), (refined, "evaluation-policy_best_refined.jsonl")):
+        capsys.readouterr()
+        assert main(["test", str(file), *few]) == 0
+        assert f"episodes: {file.with_name(results)}" in capsys.readouterr().out
+        assert main(["report", "--runs", f"a={file.with_name(results)}"]) == 0
+    assert main(["export", str(refined), "--to", "safetensors", "--out", str(checkpoint.with_name("out"))]) == 0
+    assert "1/2 = 50.0%" in (checkpoint.with_name("out") / "README.md").read_text()
+    assert main(["test", str(checkpoint.with_name("out")), *few]) == 0
+    assert (checkpoint.with_name("out") / "evaluation.jsonl").is_file()
+
+
 def test_a_checkpoint_is_loaded_once_for_all_executions(world, checkpoint, monkeypatch):
     loaded = []
     monkeypatch.setattr(

@@ -86,3 +86,16 @@ def test_a_seed_that_went_two_ways_and_two_checkpoints_in_a_file_are_refused(tmp
     write(tmp_path / "b.jsonl", [1], checkpoint="def")
     with pytest.raises(DataError, match="one policy"):
         read_labelled("base", tmp_path / "b.jsonl")
+
+
+def test_of_several_policies_in_a_file_one_can_be_chosen(tmp_path):
+    path = tmp_path / "a.jsonl"
+    for checkpoint, policy in (("abc", "ACT"), ("def", "ACT"), ("def", "ACT(refine_ratio=0)"), (None, "zero")):
+        write(path, [1], checkpoint=checkpoint, policy=policy)
+    for which, checkpoint in (("ab", "abc"), ("ACT(refine_ratio=0)", "def"), ("zero", None)):
+        assert [item.checkpoint for item in read_labelled("x", f"{path}@{which}").results] == [checkpoint]
+    for which, got in (("", "3 of ACT abc, ACT def, ACT"), ("@ACT", "2 of ACT abc, ACT def"), ("@12", "0 of ACT abc")):
+        with pytest.raises(DataError, match=got):
+            read_labelled("x", f"{path}{which}")
+    path.rename(tmp_path / "a@b.jsonl")
+    assert len(read_labelled("x", f"{tmp_path}/a@b.jsonl@ab").results) == 1

@@ -146,8 +146,8 @@ def _compare(graph: Graph, job: _Job, to: Target) -> float:
 
 
 def _results(checkpoint: Path, info: PolicyInfo) -> list[EpisodeResult]:
-    path = (checkpoint if checkpoint.is_dir() else checkpoint.parent) / "evaluation.jsonl"
-    return [one for one in read_results(path) if one.checkpoint == info.sha256] if path.is_file() else []
+    beside = sorted((checkpoint if checkpoint.is_dir() else checkpoint.parent).glob("evaluation*.jsonl"))
+    return [one for path in beside for one in read_results(path) if one.checkpoint == info.sha256]
 
 
 def _act(job: _Job, folder: Path) -> tuple[Graph, list[str]]:

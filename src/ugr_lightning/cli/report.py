@@ -20,7 +20,8 @@ def _report(
 
     Args:
         paths: folders of `ugr benchmark`, or of earlier reports.
-        runs: single results files, each `NAME=FILE`; one name may occur for several training seeds.
+        runs: single results files, each `NAME=FILE`; one name may occur for several training seeds. `NAME=FILE@WHICH`
+            is one policy of several in a file, by its name or by how its checkpoint's SHA-256 begins.
         baseline: compare the others with this policy only; null compares all pairs.
         out: folder for `report.md`, `rates.csv`, `comparisons.csv` and `summary.jsonl`, of which
             the same report can be made again; null prints Markdown.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.errors import ConfigError, SimulationError
-from ugr_lightning.training.runs import resolve_checkpoint
+from ugr_lightning.training.runs import FILES, resolve_checkpoint
 
 if TYPE_CHECKING:
     from ugr_lightning.contract import ChunkPolicy
@@ -132,7 +132,8 @@ def _test(
         executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk;
             null means `aggregate` and 25, or the whole chunk where it is shorter.
         workers: simulator processes.
-        out: results file; null appends to `evaluation.jsonl` beside the checkpoint.
+        out: results file; null appends to `evaluation.jsonl` beside a best checkpoint, `evaluation-<checkpoint>.jsonl`
+            beside another.
         traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
         device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
@@ -148,14 +149,13 @@ def _test(
     file = resolve_checkpoint(checkpoint, run, root)
     print(f"checkpoint: {file}")
     policy, info = load_policy(file)
-    beside = file if file.is_dir() else file.parent
     spec = evaluation_spec(
         info.data,
         task,
         "evaluation",
         episodes,
         workers=workers,
-        out=Path(out) if out else beside / "evaluation.jsonl",
+        out=Path(out) if out else _results_of(file),
         traces=Path(traces) if traces else None,
         resume=resume or shard is not None,
     )
@@ -167,6 +167,7 @@ def _test(
     with Simulators() as simulators:
         for execution in executions or both_executions(policy):
             results += run_episodes(actor, replace(mine, execution=execution), simulators=simulators)
+    print(f"episodes: {spec.out}")
     return _tell(results, actor)
 
 
@@ -184,6 +185,15 @@ def _tell(results: Sequence["EpisodeResult"], actor: "Actor | str") -> int:
         fix = "Mend what it names; where that is the simulator, `ugr doctor` checks it."
         raise SimulationError("episodes", "at least one that comes to its end", got, fix)
     return 0
+
+
+def _results_of(checkpoint: Path) -> Path:
+    """Each checkpoint of a run has a results file of its own: a report compares policies, one a file."""
+    if checkpoint.is_dir():
+        return checkpoint / "evaluation.jsonl"
+    return checkpoint.with_name(
+        "evaluation.jsonl" if checkpoint.name == FILES["best"] else f"evaluation-{checkpoint.stem}.jsonl"
+    )
 
 
 def both_executions(policy: "ChunkPolicy") -> list[ExecutionName]:

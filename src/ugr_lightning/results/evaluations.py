@@ -111,22 +111,32 @@ def read_benchmark(folder: str | Path) -> list[Evaluation]:
 def read_labelled(label: str, path: str | Path) -> Evaluation:
     """One results file under a name of the user's choice; the training seed is read from `config.yaml` beside it.
 
+    `FILE@WHICH` are those of one policy of several in a file, by its name or by how its checkpoint's SHA-256 begins.
     Episodes of `zero`, `random` and `expert`, which `ugr demo` writes into the same file, are left out where there
     are episodes of a checkpoint.
 
     Raises:
         DataError: the file is damaged, or holds episodes of more than one policy.
     """
-    path = Path(path)
-    results = read_results(path)
-    trained = [item for item in results if item.checkpoint is not None]
-    results = _once(path, trained or results)
+    path, which = Path(path), ""
+    if not path.is_file() and "@" in path.name:
+        name, _, which = path.name.rpartition("@")
+        path = path.with_name(name)
+    everyone = read_results(path)
+    trained = [item for item in everyone if item.checkpoint is not None]
+    results = [item for item in (everyone if which else trained or everyone) if _is_meant(item, which)]
     actors = {(item.policy, item.checkpoint) for item in results}
     if len(actors) != 1:
-        got = f"{len(actors)}: " + ", ".join(sorted(f"{name} {(sha or '')[:8]}".strip() for name, sha in actors))
-        raise DataError(path, "episodes of one policy", got, "Write one file per checkpoint with `ugr test --out`.")
+        there = actors or {(item.policy, item.checkpoint) for item in everyone}
+        got = f"{len(actors)} of " + ", ".join(sorted(f"{name} {(sha or '')[:8]}".strip() for name, sha in there))
+        fix = f"Say whose they shall be: {path}@WHICH, by the policy's name or its checkpoint's first digits."
+        raise DataError(path, "episodes of one policy", got, fix)
     seed = run_config(path.with_name("config.yaml")).get("seed_everything")
-    return Evaluation(label, seed if isinstance(seed, int) else None, path, results)
+    return Evaluation(label, seed if isinstance(seed, int) else None, path, _once(path, results))
+
+
+def _is_meant(item: EpisodeResult, which: str) -> bool:
+    return item.policy == which or (item.checkpoint or "").startswith(which)
 
 
 def run_config(path: Path) -> dict[str, Any]:
