@@ -11,6 +11,7 @@ import pytest
 from deployed import Recaller, looking_act, save, tiny_act
 from fake_policy import Reacher
 from fake_simulator import FakeSimulator
+from folders import files_of
 from PIL import Image
 from robotwin_environment import TaskEnv, evaluate, import_policy, read_settings
 
@@ -305,3 +306,18 @@ def test_a_folder_of_somebody_else_is_left_alone(reacher, tmp_path):
     assert read_settings(folder)["execution"] == 2
     with pytest.raises(ConfigError, match="Python module"):
         robotwin.write_policy(reacher, tmp_path / "my-policy")
+
+
+def test_what_was_edited_is_not_written_over(reacher, tmp_path):
+    folder = tmp_path / "UGR"
+    robotwin.write_policy(reacher, folder, execution=2)
+    for name in ("deploy_policy.yml", "README.md"):
+        whole = (folder / name).read_text()
+        (folder / name).write_text(whole.replace("policy", "Policy"))
+        before = files_of(folder)
+        with pytest.raises(ConfigError, match=rf"{name}: .* edited since, .*\. Move it away"):
+            robotwin.write_policy(reacher, folder, execution=3)
+        assert files_of(folder) == before
+        (folder / name).write_text(whole)
+    robotwin.write_policy(reacher, folder, execution=3)
+    assert read_settings(folder)["execution"] == 3

@@ -10,6 +10,8 @@ from deployed import save, tiny_act
 
 from ugr_lightning.cli.main import main
 
+SETTINGS = {"robotwin": "deploy_policy.yml", "xpolicylab": "deploy.yml"}
+
 
 @pytest.fixture(scope="module")
 def checkpoints(tmp_path_factory):
@@ -26,14 +28,19 @@ def test_a_folder_is_written_with_the_settings_asked_for(checkpoints, tmp_path, 
     options = ["--execution", "5", "--cameras.cam_high", "overhead"]
     assert main(["bridge", evaluator, str(file), "--out", str(folder), *options]) == 0
     assert str(folder / "eval.sh") in capsys.readouterr().out
-    settings = yaml.safe_load(
-        (folder / {"robotwin": "deploy_policy.yml", "xpolicylab": "deploy.yml"}[evaluator]).read_text()
-    )
+    settings = yaml.safe_load((folder / SETTINGS[evaluator]).read_text())
     assert settings["policy_name"] == "Mine"
     assert settings["execution"] == 5
     assert settings["cameras"]["cam_high"] == "overhead"
     assert settings["cameras"]["cam_left_wrist"] in ("left_camera", "cam_left_wrist")
     assert settings["checkpoint"] == str(file.resolve())
+
+
+@pytest.mark.parametrize("evaluator", ["robotwin", "xpolicylab"])
+def test_of_a_run_it_is_the_best_checkpoint(checkpoints, tmp_path, evaluator):
+    folder = tmp_path / "UGR"
+    assert main(["bridge", evaluator, "--run", str(checkpoints), "--out", str(folder)]) == 0
+    assert str(checkpoints / "policy_best.ckpt") in (folder / SETTINGS[evaluator]).read_text()
 
 
 @pytest.mark.parametrize("evaluator", ["robotwin", "xpolicylab"])

@@ -55,6 +55,14 @@ def test_test_rolls_out_the_best_checkpoint_in_both_modes_on_the_evaluation_seed
     assert len(Path("runs/tiny/version_0/evaluation.jsonl").read_text().splitlines()) == 6
 
 
+def test_a_run_alone_means_its_best_checkpoint_and_not_the_expert(world, checkpoint, capsys):
+    command = ["rollout", "--run", str(checkpoint.parent), "--episodes", "1"]
+    assert main(command) == 0
+    assert world[0]["checkpoint"] is not None
+    assert main([*command, "--policy", "zero"]) == 2
+    assert "not both" in capsys.readouterr().err
+
+
 def test_each_checkpoint_of_a_run_has_results_of_its_own_that_can_be_reported(
     world, checkpoint, ten_demonstrations, capsys
 ):

@@ -1,5 +1,6 @@
-"""Folders that other projects import: written from the package's templates, and never over somebody else's files."""
+"""Folders that other projects import: written from the package's templates, and never over what somebody else wrote."""
 
+import hashlib
 import json
 import re
 import shutil
@@ -12,8 +13,15 @@ from ugr_lightning.errors import ConfigError
 from ugr_lightning.rollout.alarm import alarms_path
 from ugr_lightning.system.files import publish, publish_folder, publish_text
 
-MARK = "Written by `ugr bridge"
-"""Every file of ours contains it; other files are left alone."""
+MARK = r"(Written by `ugr bridge \w+`)"
+"""Every file of ours contains it, and behind it a digest of the file without the digest; other files are left alone."""
+
+
+def _signed(text: str) -> str:
+    """A file as it is written: with the digest of the rest of it."""
+    plain = re.sub(MARK + r" \(\w{12}\)", r"\1", text, count=1)
+    digest = hashlib.sha256(plain.encode()).hexdigest()[:12]
+    return re.sub(MARK, rf"\1 ({digest})", plain, count=1)
 
 
 def _write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[Path]:
@@ -21,10 +29,14 @@ def _write_folder(template: str, out: Path, values: Mapping[str, str]) -> list[P
     contents: dict[Path, str] = {}
     for source in sorted(files("ugr_lightning.bridges").joinpath("templates", template).iterdir(), key=str):
         body = source.read_text(encoding="utf-8")
-        contents[out / source.name.removesuffix(".txt")] = re.sub("@([A-Z_]+)@", lambda found: values[found[1]], body)
+        body = re.sub("@([A-Z_]+)@", lambda found: values[found[1]], body)
+        contents[out / source.name.removesuffix(".txt")] = _signed(body)
     for path in contents:
-        if path.exists() and MARK not in path.read_text(encoding="utf-8", errors="replace"):
-            raise ConfigError(path, "a file that `ugr bridge` wrote", "another one", "Choose another folder.")
+        text = path.read_text(encoding="utf-8", errors="replace") if path.exists() else None
+        if text is not None and not (re.search(MARK, text) and text == _signed(text)):
+            got = "another one, one that was edited since, or of an earlier version"
+            fix = "Move it away, or choose another folder."
+            raise ConfigError(path, "a file as `ugr bridge` wrote it", got, fix)
     try:
         out.mkdir(parents=True, exist_ok=True)
         for path, content in contents.items():
@@ -59,7 +71,7 @@ def write_adapter_folder(
         The files written.
 
     Raises:
-        ConfigError: a file in it is not ours, it cannot be written, or its name cannot be imported.
+        ConfigError: a file in it is not ours or was edited, it cannot be written, or its name cannot be imported.
         CheckpointError: the checkpoint cannot be evaluated.
     """
     if not out.name.isidentifier():

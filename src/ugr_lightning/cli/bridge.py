@@ -8,11 +8,11 @@ from ugr_lightning.cli.parsing.call import call_one_of
 from ugr_lightning.cli.rollout import ExecutionName
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.system.signals import Stopped
-from ugr_lightning.training.runs import resolve_checkpoint
+from ugr_lightning.training.runs import or_best, resolve_checkpoint
 
 
 def _robotwin(
-    checkpoint: str,
+    checkpoint: str = "best",
     run: str | None = None,
     root: str = "runs",
     out: str = "policy/UGR",
@@ -43,7 +43,7 @@ def _robotwin(
 
 
 def _xpolicylab(
-    checkpoint: str,
+    checkpoint: str = "best",
     run: str | None = None,
     root: str = "runs",
     out: str = "policy/UGR",
@@ -90,7 +90,8 @@ def _serve(
     """Answer XPolicyLab's environment clients over a websocket, until interrupted.
 
     Args:
-        checkpoint: `best`, `best_loss`, `last`, or a checkpoint file; null takes the adapter folder's.
+        checkpoint: `best`, `best_loss`, `last`, or a checkpoint file; null takes `best` of a `run` that is given, or
+            the adapter folder's.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         folder: adapter folder written by `ugr bridge xpolicylab`; null serves the checkpoint with the usual settings.
@@ -112,6 +113,7 @@ def _serve(
 
     names = {"bench_name": bench_name, "task_name": task_name, "ckpt_name": ckpt_name, "env_cfg_type": env_cfg_type}
     given = {**names, "action_type": action_type, "seed": seed, "execution": execution}
+    checkpoint = or_best(checkpoint, run)
     given["checkpoint"] = None if checkpoint is None else str(resolve_checkpoint(checkpoint, run, root).resolve())
     if folder is None and checkpoint is None:
         fix = "Give --checkpoint FILE, or --folder of `ugr bridge xpolicylab`."

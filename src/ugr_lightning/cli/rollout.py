@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.errors import ConfigError, SimulationError
-from ugr_lightning.training.runs import FILES, resolve_checkpoint
+from ugr_lightning.training.runs import FILES, or_best, resolve_checkpoint
 
 if TYPE_CHECKING:
     from ugr_lightning.contract import ChunkPolicy
@@ -42,7 +42,8 @@ def _rollout(
     """Let a policy act in a task and count its successes.
 
     Args:
-        checkpoint: `best`, `best_loss`, `last`, a checkpoint file, or a folder from `ugr export --to safetensors`.
+        checkpoint: `best`, `best_loss`, `last`, a checkpoint file, or a folder from `ugr export --to safetensors`;
+            null takes `best` of a `run` that is given.
         policy: without a checkpoint, who acts: `expert`, which null means, `zero` or `random`.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
@@ -66,6 +67,7 @@ def _rollout(
     from ugr_lightning.rollout.actors import DUMMIES
     from ugr_lightning.rollout.evaluate import checkpoint_actor, evaluation_spec, run_episodes
 
+    checkpoint = or_best(checkpoint, run)
     if policy not in (None, *DUMMIES):
         fix = "A checkpoint comes first or behind --checkpoint: `ugr rollout FILE`."
         raise ConfigError("--policy", f"one of {', '.join(DUMMIES)}", policy, fix)

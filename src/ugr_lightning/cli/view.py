@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ugr_lightning.cli.parsing.call import Count, call
 from ugr_lightning.errors import ConfigError, DataError
-from ugr_lightning.training.runs import resolve_checkpoint
+from ugr_lightning.training.runs import or_best, resolve_checkpoint
 
 
 def _view(
@@ -25,7 +25,8 @@ def _view(
     Args:
         path: demonstrations of any format, a folder or a file; or a trace from `ugr rollout --traces`.
         episode: which demonstration; null for the first.
-        checkpoint: `best`, `best_loss`, `last`, or a checkpoint file, to see what it predicts along the demonstration.
+        checkpoint: `best`, `best_loss`, `last`, or a checkpoint file, to see what it predicts along the demonstration;
+            null takes `best` of a `run` that is given.
         run: name or folder of a run; null takes the newest run.
         root: folder of all runs.
         stride: control steps between two of its predictions.
@@ -37,6 +38,7 @@ def _view(
     if place.suffix == ".ckpt":
         fix = f"Say along which demonstrations: `ugr view FOLDER --checkpoint {path}`."
         raise ConfigError("ugr view", "demonstrations or a trace", "a checkpoint", fix)
+    checkpoint = or_best(checkpoint, run)
     file = None if checkpoint is None else resolve_checkpoint(checkpoint, run, root)
     if out is not None:
         _write(place, episode, file, stride, Path(out).expanduser())

@@ -102,6 +102,16 @@ def resolve_checkpoint(which: str, run: str | None, root: str | Path) -> Path:
     raise CheckpointError(where, expected, got, fix)
 
 
+def or_best(checkpoint: str | None, run: str | None) -> str | None:
+    """What `--checkpoint` means where it may be left out: the best of a run that is named, otherwise none.
+
+    Args:
+        checkpoint: as given.
+        run: as given.
+    """
+    return "best" if checkpoint is None and run is not None else checkpoint
+
+
 def _newest_run(root: Path) -> str:
     """The run that was written to last; `run` where there is none, which then is not found."""
     found = sorted(root.glob("*/version_*/*.ckpt"), key=lambda path: path.stat().st_mtime)

@@ -2,6 +2,7 @@ from typing import Literal
 
 import pytest
 
+from ugr_lightning.cli.main import main
 from ugr_lightning.cli.parsing.call import Count, CountOrZero, call, call_one_of
 from ugr_lightning.errors import ConfigError
 
@@ -124,3 +125,8 @@ def test_a_wrong_value_is_told_in_words_and_not_in_types(words, says):
     with pytest.raises(ConfigError) as error:
         call(function, "try", words)
     assert str(error.value) == f"{says} Correct the value."
+
+
+def test_what_is_missing_is_named(capsys):
+    assert main(["export", "best"]) == 2
+    assert "command line: expected --to, --out, got a command without. Add it" in capsys.readouterr().err

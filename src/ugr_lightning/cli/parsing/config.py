@@ -133,6 +133,10 @@ def explain(error: Exception, parser: ArgumentParser | None) -> UGRError:
             return cause
         cause = cause.__cause__ or cause.__context__
     message = " ".join(str(error).split())
+    required = re.search(r"arguments are required: ([\w., ]+)", message)
+    if required:
+        wanted = ", ".join(f"--{name}" for name in required[1].split(", "))
+        return ConfigError("command line", wanted, "a command without", "Add it; `--help` explains.")
     unknown = re.findall(r"[Kk]ey '?\"?([\w.\-]+)'?\"? is not expected", message)
     unknown += re.findall(r"(?:[Nn]o action for key|Nested key|[Oo]ption) '?\"?([\w.\-]+)'?\"?", message)
     words = re.findall(r"[Uu]nrecognized arguments: (\S+)", message)
