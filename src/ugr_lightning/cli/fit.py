@@ -164,7 +164,7 @@ class UGRCLI(LightningCLI):
         try:
             self.config = parser.parse_args(args)
         except argparse.ArgumentError as error:
-            raise explain(error, self._parser(args[0])) from None
+            raise explain(error, self._parser(args[0]), args) from None
 
     def _parse_ckpt_path(self) -> None:
         """Say once and for all where the run is, and resolve `best` and `last` before Lightning sees them.
