@@ -187,10 +187,9 @@ def _refused_class(told: str, error: BaseException) -> tuple[str, str, str] | No
     """Expected, got and advice where a key takes an object and what was named is no such class; None for other keys."""
     union = re.search(r"Subtypes: \[(.*?)\] Errors: ", told)
     choices = [_imported(path) for path in re.findall(r"<class '([\w.]+\.\w+)'>", union[1])] if union else []
+    choices = [kind for kind in choices if isinstance(kind, type) and not issubclass(kind, (Path, int, float, str))]
     settings = [field.name for kind in choices if is_dataclass(kind) for field in fields(kind)]
-    kinds = [
-        kind.__name__ for kind in choices if isinstance(kind, type) and kind is not Path and not is_dataclass(kind)
-    ]
+    kinds = [kind.__name__ for kind in choices if not is_dataclass(kind)]
     if union is None:
         kinds = re.findall(r"subclass of (\w+)", told)
     named = re.search(_NAMED, told)
@@ -217,7 +216,7 @@ def _refused_class(told: str, error: BaseException) -> tuple[str, str, str] | No
     if "does not correspond to a subclass" in told or not isinstance(found, type):
         return expected, f"{path}, which is not derived from it", "Derive it, or name another class."
     if inspect.isabstract(found):
-        lacking = ", ".join(sorted(found.__abstractmethods__))
+        lacking = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
         return expected, f"{path}, which does not define {lacking}", "Define what is missing."
     while error.__cause__ is not None:
         error = error.__cause__
