@@ -2,7 +2,7 @@ import pytest
 from torch import OutOfMemoryError
 
 from ugr_lightning.cli.failures import explain_training
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.errors import ConfigError, require_extra
 
 FAILURES = {
     "a loader process that was killed": (
@@ -30,6 +30,13 @@ def test_what_a_class_of_ours_refuses_is_told_also_where_only_its_type_was_named
     outer.__cause__ = ValueError("Problem with given class_path")
     outer.__cause__.__cause__ = refused
     assert explain_training(outer) is refused
+
+
+def test_an_error_of_ours_keeps_its_advice_also_where_an_import_was_its_cause():
+    with pytest.raises(ConfigError) as raised:
+        require_extra("Diffusion Policy", "diffusion", "no_such_package")
+    assert "ugr-lightning[diffusion]" in str(raised.value)
+    assert explain_training(raised.value) is None
 
 
 def test_a_fault_of_our_own_stays_one():

@@ -16,7 +16,9 @@ from recordings import record
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.data.datamodule import ChunkDataModule
 from ugr_lightning.system.lock import locked
+from ugr_lightning.training.module import PolicyModule
 
 RUN = Path("runs/tiny/version_0")
 
@@ -49,6 +51,19 @@ def test_fit_leaves_config_logs_and_checkpoints_and_a_second_one_disturbs_nothin
     assert "figures/chunk" in tags["images"]
     assert "hp/val/action_error" in tags["scalars"]
     assert not weights(RUN)["policy.head.weight"].equal(weights(RUN.parent / "version_1")["policy.head.weight"])
+
+
+@pytest.mark.parametrize("hook", ["prepare_data", "training_step"])
+def test_a_training_that_fails_before_its_first_step_is_done_leaves_no_folder(tiny_config, monkeypatch, hook):
+    owner = ChunkDataModule if hook == "prepare_data" else PolicyModule
+
+    def fail(*_):
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(owner, hook, fail)
+    with pytest.raises(ZeroDivisionError):
+        main(["fit", "--config", tiny_config])
+    assert not list(Path("runs").iterdir())
 
 
 def test_two_fits_with_the_same_seed_agree_bit_for_bit_and_loader_workers_change_nothing(tiny_config):

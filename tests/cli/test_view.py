@@ -5,6 +5,7 @@ import pytest
 from made_up import episode
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.cli.view import DISPLAYS
 from ugr_lightning.data.formats import detect
 from ugr_lightning.rollout.traces import write_trace
 from ugr_lightning.rollout.trajectory import EpisodeTrace
@@ -83,6 +84,15 @@ def test_what_cannot_be_shown_is_said(folder, tmp_path, monkeypatch, capsys, arg
     assert main(["view", *arguments, "--out", "view.rrd"]) == 2
     assert says in capsys.readouterr().err
     assert not (tmp_path / "view.rrd").exists()
+
+
+def test_without_a_display_a_file_is_advised_in_place_of_a_window(folder, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr("subprocess.call", lambda *_: pytest.fail("opened a viewer"))
+    for name in DISPLAYS:
+        monkeypatch.delenv(name, raising=False)
+    assert main(["view", str(folder)]) == 2
+    assert f"`ugr view {folder} --out view.rrd`" in capsys.readouterr().err
 
 
 def test_without_the_viewer_the_extra_is_named(folder, tmp_path, monkeypatch, capsys):

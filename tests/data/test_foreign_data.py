@@ -128,6 +128,11 @@ def test_a_folder_of_another_format_under_the_root_is_read_and_never_recorded_in
         more.prepare_data()
 
 
+def test_a_folder_of_one_demonstration_is_not_told_to_train_on_one(folders):
+    with pytest.raises(DataError, match=r"5 demonstrations, got 1\. Add others: at least 2 are needed"):
+        _data(next(folders["act"].glob("*0.hdf5")), episodes=5).prepare_data()
+
+
 @pytest.mark.parametrize("kind", ["ours", "empty"])
 def test_a_folder_that_is_named_is_never_recorded_into(kind, folders, tmp_path):
     folder = folders["ours"] if kind == "ours" else tmp_path

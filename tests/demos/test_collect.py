@@ -222,6 +222,13 @@ def test_a_seed_that_kills_its_process_twice_is_skipped(tmp_path, capsys):
     assert "skipped" in capsys.readouterr().err
 
 
+def test_a_seed_that_is_skipped_is_told_with_where_the_expert_could_not_reach(tmp_path, capsys):
+    record(tmp_path, episodes=4, task="out_of_reach")
+    assert read_seeds(tmp_path) == SOLVED[:4]
+    told = "Seed 3 is skipped: left arm, phase `reach`: expected a tool pose within its reach, got position [9.0, 0.0"
+    assert told in capsys.readouterr().err
+
+
 def test_a_task_that_the_expert_cannot_do_is_an_error(tmp_path):
     with pytest.raises(SimulationError, match="50 seeds in a row"):
         record(tmp_path, task="unsolvable", noise=Noise(std=0))

@@ -43,6 +43,12 @@ def test_a_simulator_that_dies_is_a_failure(capsys):
     assert "Seed 2 counts as a failure" in capsys.readouterr().err
 
 
+def test_a_pose_out_of_reach_is_told_with_its_seed(capsys):
+    results = perform("out_of_reach", [2, 3], **QUICK)
+    assert [item.success for item in results] == [True, False]
+    assert "Seed 3: left arm, phase `reach`: expected a tool pose within its reach, got" in capsys.readouterr().err
+
+
 def test_a_row_counts_successes_lengths_and_costs(row):
     assert (row.expert.successes, row.expert.n) == (8, 10)  # the expert gives up on 3 and 8
     assert (row.expert.low, row.expert.high) == wilson_interval(8, 10)
@@ -136,7 +142,7 @@ def test_the_first_seeds_that_the_expert_solves_are_written_and_read_back(its_se
 
 def test_an_expert_that_fails_leaves_the_list_as_it_was(its_seeds):
     its_seeds.write_text("before")
-    with pytest.raises(SimulationError, match=r"got 0 of 9, not 100000, 100001, .*Repair the task's expert"):
+    with pytest.raises(SimulationError, match=r"got failures on 9 of 9: 100000, .* 100004 and 4 more\. Watch it"):
         find_evaluation_seeds("unsolvable", count=9, **QUICK)
     assert its_seeds.read_text() == "before"
 

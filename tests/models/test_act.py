@@ -97,6 +97,12 @@ def test_only_chosen_steps_are_changed(tiny, batch, variant):
     assert torch.equal(changed, chunk.refined)
 
 
+def test_a_selector_that_breaks_a_promise_is_refused_before_any_training(tiny, monkeypatch):
+    monkeypatch.setattr(Full, "select", lambda self, log_variance, valid, training: valid.float())
+    with pytest.raises(ConfigError, match=r"Full\.select: expected bool \(2, 10\)"):
+        tiny(refine=Full())
+
+
 def test_sparse_prediction_equals_dense_prediction(tiny, batch):
     policy = noisy_branch(tiny(refine=Uncertainty()))
     sparse = policy.predict(batch.observation)

@@ -56,6 +56,12 @@ def test_a_policy_is_judged_seed_by_seed(runner, execution):
     assert first.queries == -(-first.steps // every)
 
 
+def test_what_the_expert_could_not_reach_is_told(capsys):
+    results = run("expert", [2, 3], task="out_of_reach")
+    assert [(result.success, result.crash) for result in results] == [(True, None), (False, None)]
+    assert "Seed 3: left arm, phase `reach`: expected a tool pose within its reach" in capsys.readouterr().err
+
+
 def test_the_dummies_run_through_the_same_runner(runner):
     zero = runner("zero", SEEDS)
     assert [(result.success, result.steps) for result in zero] == [(False, FakeSimulator.horizon)] * len(SEEDS)

@@ -74,7 +74,7 @@ def test_grippers_ramp_while_the_arm_moves():
 
 
 def test_a_goal_out_of_reach_raises():
-    with pytest.raises(UnreachableError):
+    with pytest.raises(UnreachableError, match=r"left arm, phase `reach`: .*position \[0\.6, 0\.0, 0\.3\]"):
         list(Arms(START).move({"left": TcpPose(np.array([0.6, 0.0, 0.3]), gripper_down(0.0))}, steps=5, phase="reach"))
 
 

@@ -1,15 +1,17 @@
 import json
 import os
 import re
+from functools import partial
 
 import pytest
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim import tasks
-from ugr_lightning.sim.registry import robot_of, simulator_of
+from ugr_lightning.sim.registry import open_simulator, robot_of, simulator_of
 from ugr_lightning.sim.seeds import evaluation_seeds
 from ugr_lightning.sim.task_files import outside_names
+from ugr_lightning.system.workers import Worker
 
 TASK = '''"""Close the hand."""
 from ugr_lightning.sim.scene import TwoArmEnv
@@ -97,6 +99,13 @@ def test_a_name_that_is_taken_or_impossible_is_refused(folder, name, complaint):
     (folder / f"{name}.py").write_text(TASK)
     with pytest.raises(ConfigError, match=complaint):
         tasks.task_names()
+
+
+def test_a_fault_while_a_task_runs_is_told_with_the_line_of_its_file(folder):
+    (folder / "fails_later.py").write_text(TASK.replace("        pass", "        self.cube = undefined"))
+    opened = Worker(partial(open_simulator, "fails_later", render=False))
+    with opened, pytest.raises(SimulationError, match=r"fails_later\.py, line 9\)\. Correct the file\."):
+        opened.receive()
 
 
 @pytest.mark.parametrize(

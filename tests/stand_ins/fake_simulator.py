@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from ugr_lightning.embodiment import CAMERAS
-from ugr_lightning.sim.expert import ExpertStep
+from ugr_lightning.sim.expert import Arms, ExpertStep
 from ugr_lightning.sim.frame import Frame
+from ugr_lightning.sim.kinematics import TcpPose
 from ugr_lightning.sim.outside_simulator import OutsideSimulator
 
 HOME = np.tile(np.array([0, -0.9, 1.1, 0, -0.3, 0, 1], np.float32), 2)
@@ -25,7 +26,7 @@ class FakeSimulator(OutsideSimulator):
     Tasks: `reach`; `one_arm`: the same with 7 joints and one camera; `two_long_arms`: with 16 joints; `unsolvable`: no
     seed succeeds; `deadly`: seed 2 kills the process at step 3; `deadly_once`: only if the file named by MARKER is
     absent; `hang`: seed 2 never returns; `faulty`: seed 2 raises. In every task the expert gives up on the seeds 3, 8,
-    13, ...
+    13, ...; in `out_of_reach` because of a pose that it cannot reach.
     """
 
     cameras = CAMERAS
@@ -65,6 +66,9 @@ class FakeSimulator(OutsideSimulator):
 
     def _demonstrate(self):
         if self.seed % 5 == 3:
+            far = TcpPose(np.array([9.0, 0.0, 0.0]), np.eye(3))
+            if self.task == "out_of_reach":
+                yield from Arms(self.commanded).move({"left": far}, steps=5, phase="reach")
             return
         for step in range(STEPS):
             action = np.resize(HOME, self.action_dim)

@@ -46,7 +46,10 @@ def test_a_worker_answers_fails_and_is_reaped():
         with pytest.raises(ConfigError, match="here: expected a, got b"):
             worker.receive()
         worker.send("fail", ValueError("odd"))
-        with pytest.raises(SimulationError, match="ValueError: odd"):
+        with pytest.raises(SimulationError, match=r"test_workers\.py: .*ValueError: odd \(.*Correct the file\."):
+            worker.receive()
+        worker.send("no_method")
+        with pytest.raises(SimulationError, match=r"AttributeError: .*Report this"):
             worker.receive()
         worker.send("say", "still there")
         assert worker.receive()[1] == pid

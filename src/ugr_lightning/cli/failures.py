@@ -5,6 +5,7 @@ import os
 import traceback
 from collections.abc import Iterator
 
+from ugr_lightning.cli.parsing.config import explain
 from ugr_lightning.errors import ConfigError, UGRError
 
 _DISK = {
@@ -47,6 +48,8 @@ def explain_training(error: Exception) -> UGRError | None:
     """
     from torch import OutOfMemoryError
 
+    if isinstance(error, UGRError):
+        return None
     got = " ".join(str(error).split())[:600]
     if isinstance(error, RuntimeError) and got.startswith("DataLoader worker"):
         fix = "Memory has run out, or in a container shared memory (`docker run --shm-size 8g`): give fewer, or 0."
@@ -61,7 +64,9 @@ def explain_training(error: Exception) -> UGRError | None:
     if missing is not None:
         fix = "Install it, or leave out what needs it."
         return ConfigError("ugr fit", "the packages that its config needs", missing, fix)
-    if _is_lightnings(error):
+    if _raised_by(error, "jsonargparse."):  # what it says of a class whose constructor refused
+        return explain(error, None)
+    if _raised_by(error, "lightning.", "lightning_"):
         fix = "Correct what it names, in the config or behind `--trainer`."
         return ConfigError("ugr fit", "settings that Lightning can work with", got, fix)
     return None
@@ -74,9 +79,9 @@ def _causes(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__
 
 
-def _is_lightnings(error: Exception) -> bool:
-    """Whether Lightning itself has raised an error, and not what it called."""
-    if isinstance(error, (UGRError, OSError)) or error.__traceback__ is None:
+def _raised_by(error: Exception, *names: str) -> bool:
+    """Whether a package itself has raised an error, and not what it called."""
+    if isinstance(error, OSError) or error.__traceback__ is None:
         return False
     *_, (frame, _) = traceback.walk_tb(error.__traceback__)
-    return str(frame.f_globals.get("__name__")).startswith(("lightning.", "lightning_"))
+    return str(frame.f_globals.get("__name__")).startswith(names)

@@ -8,7 +8,7 @@ import shutil
 import sys
 import warnings
 from collections.abc import Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -57,16 +57,20 @@ _RUN_FOLDER = "UGR_RUN_FOLDER"  # tells the other processes of a distributed run
 class RunRecord(SaveConfigCallback):
     """Leaves `config.yaml` in the run's folder, and its values beside the final scores in TensorBoard's HPARAMS.
 
-    The file is written when the training has started, not before: it says what the run's checkpoints are from. It
-    starts the same training anywhere, so its folders are absolute and it names no checkpoint to go on from.
+    The file is written after the first step, not before: it says what the run's checkpoints are from. It starts the
+    same training anywhere, so its folders are absolute and it names no checkpoint to go on from.
     """
+
+    written = False
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Nothing yet: whether the training can start is not known."""
 
-    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """Write the config."""
-        folder = Path(str(trainer.log_dir))
+    def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
+        """Write the config, once."""
+        if self.written:
+            return
+        folder, self.written = Path(str(trainer.log_dir)), True
         if trainer.is_global_zero:
             publish_text(folder / self.config_filename, self.parser.dump(anywhere(self.config), skip_none=False))
 
@@ -164,7 +168,7 @@ class UGRCLI(LightningCLI):
         try:
             self.config = parser.parse_args(args)
         except argparse.ArgumentError as error:
-            raise explain(error, self._parser(args[0])) from None
+            raise explain(error, self._parser(args[0]), args) from None
 
     def _parse_ckpt_path(self) -> None:
         """Say once and for all where the run is, and resolve `best` and `last` before Lightning sees them.
@@ -293,9 +297,11 @@ def _is_of_a_run(checkpoint: Path) -> bool:
 
 
 def _remove_if_nothing_came_of_it(folder: Path) -> None:
-    """Remove the folder of a training that never started."""
+    """Remove the folder of a training without a step, and that of its run where it was the only one."""
     if not (folder / "config.yaml").exists() and not any(folder.glob("*.ckpt")):
         shutil.rmtree(folder, ignore_errors=True)
+        with suppress(OSError):  # there are others
+            folder.parent.rmdir()
 
 
 def _listed(value: Any) -> list[Any]:

@@ -1,5 +1,6 @@
 """`ugr view`: look at a demonstration, a policy's predictions on it, or a rollout."""
 
+import os
 import subprocess
 import sys
 import tempfile
@@ -9,6 +10,9 @@ from pathlib import Path
 from ugr_lightning.cli.parsing.call import Count, call
 from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.training.runs import or_best, resolve_checkpoint
+
+DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
+"""Environment variables, one of which Linux needs for a window."""
 
 
 def _view(
@@ -44,6 +48,9 @@ def _view(
         _write(place, episode, file, stride, Path(out).expanduser())
         print(f"timeline: {out} (`rerun {out}` opens it)")
         return 0
+    if sys.platform == "linux" and not any(map(os.environ.get, DISPLAYS)):
+        fix = f"Write a file, and open it where there is one: `ugr view {path} --out view.rrd`, then `rerun view.rrd`."
+        raise ConfigError("ugr view", "a display to open a window on", "none", fix)
     with tempfile.TemporaryDirectory() as folder:
         timeline = Path(folder) / f"{place.stem}.rrd"
         _write(place, episode, file, stride, timeline)

@@ -198,6 +198,8 @@ class ChunkDataModule(lightning.LightningDataModule):
             fix = f"Record them with `{self._command()}`, or say where they are."
             if form is not None and (self.elsewhere or form.name != RECORDED):
                 fix = f"Set `data.episodes` to {len(chosen)} or less."
+                if len(chosen) < 2:
+                    fix = "Add others: at least 2 are needed, one to train and one to validate."
             of_tasks = f" of {', '.join(self.tasks)}" if self.tasks else ""
             raise DataError(self.folder, f"{self.wanted} demonstrations{of_tasks}", len(chosen), fix)
         return form, chosen, len(found)

@@ -129,13 +129,14 @@ def _record(ledger: "_Ledger", episodes: int, build: Callable[[], Recorder], wor
             if done.fault is None:
                 outcomes[seed] = done.value
             elif given.count(seed) > 1:
-                line.message(f"Seed {seed}: {done.fault}; skipped.")
                 outcomes[seed] = Outcome(seed, 0, done.fault)
             else:
                 line.message(f"Seed {seed}: {done.fault}; trying it once more.")
                 again.append(seed)
             for outcome in ledger.file(outcomes, episodes):
                 useless = 0 if outcome.failure is None else useless + 1
+                if outcome.failure is not None:
+                    line.message(f"Seed {outcome.seed} is skipped: {outcome.failure}")
                 if useless >= HOPELESS:
                     got = f"{useless} seeds in a row without success, the last because: {outcome.failure}"
                     fix = "Check the task with `ugr rollout --policy expert`, or record with less noise."

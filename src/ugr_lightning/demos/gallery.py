@@ -77,6 +77,7 @@ class Photographer:
         finally:
             simulator.close()
         got = f"no success on the seeds {self._first_seed} to {self._first_seed + TRIES - 1}"
+        got += f", the last because: {simulator.gave_up}" if simulator.gave_up else ""
         raise SimulationError(f"expert of {task}, {setting}", "a task that it solves", got, "Repair the expert.")
 
     def _write_gif(self, path: Path, frames: list[tuple[tuple[bytes, ...], bool]], control_hz: float) -> None:

@@ -95,7 +95,7 @@ class Recorder:
             if recording.frames[-1].success and steps:
                 self._write(recording, seed, attempt)
                 return Outcome(seed, steps)
-            failure = f"the expert did not succeed in {steps} steps"
+            failure = self._simulator.gave_up or f"the expert did not succeed in {steps} steps"
         return Outcome(seed, steps, failure)
 
     def _try(self, seed: int, attempt: int) -> _Attempt:

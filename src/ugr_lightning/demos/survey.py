@@ -40,12 +40,14 @@ class Performance(NamedTuple):
         success: whether the task's condition was met.
         steps: control steps of the whole script: the length of a demonstration.
         motion_hash: SHA-256 of the measured joints of all frames, the last one included.
+        gave_up: what the expert could not reach, which ended its script; None where there was no such pose.
     """
 
     seed: int
     success: bool
     steps: int
     motion_hash: str
+    gave_up: str | None = None
 
 
 class Performer:
@@ -65,7 +67,7 @@ class Performer:
         for intention in self._simulator.expert():
             frame, steps = self._simulator.step(intention.action), steps + 1
             motion.update(np.asarray(frame.measured).tobytes())
-        return Performance(seed, bool(frame.success), steps, motion.hexdigest())
+        return Performance(seed, bool(frame.success), steps, motion.hexdigest(), self._simulator.gave_up)
 
 
 def perform(
@@ -87,7 +89,9 @@ def perform(
         for done in spread(partial(Performer, open_task), "perform", seeds, workers=workers):
             if done.fault is not None:
                 line.message(f"Seed {seeds[done.job]} counts as a failure: {done.fault}")
-            results[done.job] = done.value or Performance(seeds[done.job], False, 0, "")
+            found = results[done.job] = done.value or Performance(seeds[done.job], False, 0, "")
+            if found.gave_up is not None:
+                line.message(f"Seed {found.seed}: {found.gave_up}")
             line.advance(f"{sum(item.success for item in results.values())} solved")
     return [results[index] for index in range(len(seeds))]
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from ugr_lightning.data.selection import shorten
 from ugr_lightning.demos.survey import FIRST_SEED, Performance, perform
 from ugr_lightning.errors import SimulationError
 from ugr_lightning.sim.seeds import EVALUATION_START, evaluation_seeds, seeds_hash
@@ -111,7 +112,8 @@ def find_evaluation_seeds(
         for item in perform(task, seeds, workers=workers, progress=progress):
             (solved if item.success else skipped).append(item.seed)
         if len(skipped) > len(solved):
-            got = f"{len(solved)} of {len(solved) + len(skipped)}, not {', '.join(map(str, skipped[:5]))}, ..."
-            raise SimulationError(f"expert of {task}", "most seeds solved", got, "Repair the task's expert.")
+            got = f"failures on {len(skipped)} of {len(solved) + len(skipped)}: {shorten(skipped, 5)}"
+            fix = f"Watch it: `ugr rollout --task {task} --seeds {skipped[0]} --episodes 1 --video {task}.gif`."
+            raise SimulationError(f"expert of {task}", "an expert that solves most seeds", got, fix)
     publish_text(path, json.dumps({"task": task, "version": version, "skipped": skipped, "seeds": solved}) + "\n")
     return path

@@ -30,7 +30,7 @@ from ugr_lightning.models.losses import (
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.precision import Precision, autocast, full_precision
 from ugr_lightning.models.refine.branch import BranchName, ResidualBranch
-from ugr_lightning.models.refine.selector import Selector
+from ugr_lightning.models.refine.selector import Selector, checked_budget
 from ugr_lightning.models.tokens import TokenPolicy
 from ugr_lightning.models.transformer import DecoderLayer, EncoderLayer
 from ugr_lightning.models.vision import Fold, NormName, ResNet18, StemName
@@ -199,7 +199,7 @@ class ACT(TokenPolicy):
         self.action_head = nn.Linear(dim, action_dim)
         self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
         self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
-        self.budget = refine.budget(chunk_length) if refine is not None else None
+        self.budget = checked_budget(refine, chunk_length, wants_uncertainty) if refine is not None else None
         if backbone_weights is not None:
             self.backbone.load_weights(backbone_weights)
 

@@ -100,6 +100,8 @@ class ClosedLoop:
         episode, decision = self._running[slot], self._decisions.pop(slot, None)
         episode.take(reply, decision)
         begins = decision is None
+        if reply.gave_up is not None:
+            self._line.message(f"Seed {episode.seed}: {reply.gave_up}")
         if reply.crash is not None:
             self._end(slot, reply.crash)
         elif reply.over or episode.success or episode.steps >= episode.horizon:

@@ -42,6 +42,7 @@ class Reply(NamedTuple):
         control_hz: control steps per second.
         seconds: wall-clock time of the order.
         over: whether the expert has nothing more to do.
+        gave_up: what the expert could not reach, or None.
         crash: why the simulator failed, or None.
     """
 
@@ -51,6 +52,7 @@ class Reply(NamedTuple):
     control_hz: float
     seconds: float
     over: bool = False
+    gave_up: str | None = None
     crash: str | None = None
 
 
@@ -79,7 +81,8 @@ class Stage:
         except Exception as error:  # whatever it is, it ends this episode only; the result says what it was
             crash = describe_error(error)
             self._simulators[slot] = None
-        return Reply(slot, frames, horizon, control_hz, time.perf_counter() - start, over, crash)
+        seconds = time.perf_counter() - start
+        return Reply(slot, frames, horizon, control_hz, seconds, over, simulator.gave_up, crash)
 
     def _play(self, simulator: Simulator, order: Order, frames: list[Frame]) -> bool:
         """Put the frames of an order into a list; whether the expert has come to its end."""

@@ -121,7 +121,7 @@ class Arms:
         """
         count = self._scaled(steps)
         for side, goal in goals.items():
-            self._coming[side] = self._plan(side, goal, count)
+            self._coming[side] = self._plan(side, goal, count, phase)
         openings = {side: (self.opening[side], value) for side, value in (grip or {}).items()}
         emitted = max(1, count - (self._scaled(overlap) if overlap else 0))
         for k in range(1, emitted + 1):
@@ -156,14 +156,19 @@ class Arms:
         onset = minimum_jerk((self._emitted - 1) / _ONSET)
         return ExpertStep(action.astype(np.float32), phase, float(slack * onset))
 
-    def _plan(self, side: str, goal: TcpPose | Array, count: int) -> list[Array]:
+    def _plan(self, side: str, goal: TcpPose | Array, count: int, phase: str) -> list[Array]:
         """Joint commands of a motion, added to what is left of the one before."""
         end = self._end(side)
         before = self._coming[side][:count]
         before = before + [end] * (count - len(before))
         if isinstance(goal, TcpPose):
             target = to_base(side, goal, self.base_height)
-            posture = inverse(target, end, prefer_small_rolls=_ROLL_WEIGHT)
+            try:
+                posture = inverse(target, end, prefer_small_rolls=_ROLL_WEIGHT)
+            except UnreachableError as error:
+                expected, got = "a tool pose within its reach", f"position {np.round(goal.position, 3).tolist()}"
+                fix = "Choose a nearer one, or turn the tool: joints have limits."
+                raise UnreachableError(f"{side} arm, phase `{phase}`", expected, got, fix) from error
             straight = _straight_line(before, target, self.joints[side])
             if straight is not None and np.abs(straight[-1] - posture).max() < _BRANCH_TOLERANCE:
                 return straight

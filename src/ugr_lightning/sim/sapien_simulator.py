@@ -11,7 +11,7 @@ import numpy as np
 from ugr_lightning.embodiment import CAMERAS
 from ugr_lightning.sim.expert import Arms, ExpertStep
 from ugr_lightning.sim.frame import Frame
-from ugr_lightning.sim.kinematics import SIDES, UnreachableError
+from ugr_lightning.sim.kinematics import SIDES
 from ugr_lightning.sim.render import render_device
 from ugr_lightning.sim.simulator import Simulator
 from ugr_lightning.sim.tasks import load_task
@@ -78,10 +78,7 @@ class SapienSimulator(Simulator):
         return bool(self._env.succeeded)
 
     def _demonstrate(self) -> Iterator[ExpertStep]:
-        try:
-            yield from self._env.expert(Arms(self._env.command, self.speed, self._env.surroundings.table_drop))
-        except UnreachableError:
-            return
+        return self._env.expert(Arms(self._env.command, self.speed, self._env.surroundings.table_drop))
 
     def _describe(self) -> dict[str, Any]:
         return self._scene

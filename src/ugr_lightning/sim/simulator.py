@@ -10,6 +10,7 @@ from ugr_lightning.embodiment import ACTION_DIM
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim.expert import ExpertStep
 from ugr_lightning.sim.frame import Frame, camera_projections, checked_command
+from ugr_lightning.sim.kinematics import UnreachableError
 
 
 class Simulator(ABC):
@@ -39,6 +40,8 @@ class Simulator(ABC):
     """A, numbers of a command."""
     task_version: int
     """Raised whenever the same seed means something else."""
+    gave_up: str | None = None
+    """What the expert of the episode could not reach, which ended it early; None where there was no such pose."""
 
     def __init__(
         self,
@@ -73,7 +76,7 @@ class Simulator(ABC):
             seed: of the episode.
             look: whether the frame has images.
         """
-        self._seed, self._succeeded = int(seed), False
+        self._seed, self._succeeded, self.gave_up = int(seed), False, None
         self._start(int(seed))
         return self._shown(look)
 
@@ -96,10 +99,10 @@ class Simulator(ABC):
         """The scripted expert of the current episode.
 
         It reads the simulator's state as it goes, so each of its steps has to be executed (with or without noise)
-        before the next is asked for. It ends early where an object has got out of reach; the episode is then lost.
+        before the next is asked for. It ends early where an object has got out of reach; `gave_up` then says where.
         """
         self._require_episode()
-        return self._demonstrate()
+        return self._up_to_a_pose_out_of_reach()
 
     def scene_info(self) -> dict[str, Any]:
         """Seed, and where things were at reset, as plain containers."""
@@ -136,11 +139,17 @@ class Simulator(ABC):
 
     @abstractmethod
     def _demonstrate(self) -> Iterator[ExpertStep]:
-        """The scripted expert, from the current state on."""
+        """The scripted expert, from the current state on; an UnreachableError ends the demonstration."""
 
     @abstractmethod
     def _describe(self) -> dict[str, Any]:
         """Where things were at reset, as plain containers."""
+
+    def _up_to_a_pose_out_of_reach(self) -> Iterator[ExpertStep]:
+        try:
+            yield from self._demonstrate()
+        except UnreachableError as error:
+            self.gave_up = str(error)
 
     def _require_episode(self) -> None:
         if self._seed is None:

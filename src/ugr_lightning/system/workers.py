@@ -9,11 +9,13 @@ import pickle
 import signal
 import subprocess
 import sys
+import sysconfig
 import threading
 import time
 import traceback
 from collections.abc import Callable, Sequence
 from multiprocessing import Pipe, connection
+from pathlib import Path
 from typing import Any, Self
 
 from ugr_lightning.errors import SimulationError, UGRError
@@ -23,6 +25,9 @@ START_TIMEOUT_S = 300.0
 
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
 """Without it a simulator's small tensor operations spend 20 ms a step on waking threads."""
+
+_PACKAGED = (str(Path(__file__).parents[1]), sysconfig.get_path("stdlib"), "<")
+"""How the paths of files begin that are not the user's, nor are those of installed packages."""
 
 
 class WorkerLostError(Exception):
@@ -185,19 +190,34 @@ def _answer(link: connection.Connection, call: Callable[[], tuple[Any, Any]]) ->
         link.send((None, error))
         return None
     except Exception as error:
-        got = describe_error(error)
-        link.send((None, SimulationError("simulator process", "no fault", got, "Report this with its command.")))
+        where, fix = "simulator process", "Report this with its command."
+        if line := _users_line(error):
+            where, fix = line.filename, "Correct the file."
+        link.send((None, SimulationError(where, "no fault", describe_error(error), fix)))
         return None
     link.send((value, None))
     return kept
 
 
 def describe_error(error: Exception) -> str:
-    """One line on an exception: a user's error as it is, another one with its kind and place."""
+    """One line on an exception: a user's error as it is, another one with its kind and place, the user's if any."""
     if isinstance(error, UGRError):
         return str(error)
-    place = traceback.extract_tb(error.__traceback__)[-1]
-    return f"{type(error).__name__}: {error} ({os.path.basename(place.filename)}, line {place.lineno})"
+    told = f"{type(error).__name__}: {error}"
+    if isinstance(error, SyntaxError):  # says its place itself
+        return told
+    place = _users_line(error) or traceback.extract_tb(error.__traceback__)[-1]
+    return f"{told} ({os.path.basename(place.filename)}, line {place.lineno})"
+
+
+def _users_line(error: Exception) -> traceback.FrameSummary | None:
+    """The innermost line of a file of the user's that an exception went through; None where it is all in packages."""
+    frames = traceback.extract_tb(error.__traceback__)
+    return next((frame for frame in reversed(frames) if not _is_packaged(frame.filename)), None)
+
+
+def _is_packaged(file: str) -> bool:
+    return file.startswith(_PACKAGED) or not {"site-packages", "dist-packages"}.isdisjoint(Path(file).parts)
 
 
 def _end_with_parent(parent: int) -> None:

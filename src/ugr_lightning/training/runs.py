@@ -54,7 +54,7 @@ def claim_version(home: Path) -> Path:
         number = int(existing[-1].name.removeprefix("version_")) + 1 if existing else 0
         try:
             home.mkdir(parents=True, exist_ok=True)
-            (home / f"version_{number}").mkdir()
+            (home / f"version_{number}").mkdir(parents=True)  # another process may have removed its empty home
         except FileExistsError:
             if home.is_dir():
                 continue  # another process was faster

@@ -106,6 +106,59 @@ def test_a_wrong_value_is_one_paragraph_that_names_the_key(option, key, capsys):
     assert "Traceback" not in said
 
 
+def test_an_overlay_for_another_policy_is_answered_with_the_one_that_is_meant(capsys):
+    assert main(["fit", "--config", "dp", "--config", "keyframes/act"]) == 2
+    assert "`keyframes/act` sets it: did you mean `--config keyframes/dp`?" in capsys.readouterr().err
+
+
+RULES = """
+from ugr_lightning.models.refine.selector import Selector
+
+class Mine(Selector):
+    def __init__(self, spacing: int = 3):
+        super().__init__()
+        raise ValueError("no spacing is right")
+
+    def budget(self, chunk_length): ...
+    def select(self, log_variance, valid, training): ...
+
+class Unfinished(Selector): ...
+class Other: ...
+"""
+
+
+@pytest.mark.parametrize(
+    ("named", "said"),
+    [
+        (
+            "my_rulez.Mine",
+            "model.policy.refine: expected the path of a Selector or null, got my_rulez.Mine, and there is",
+        ),
+        ("my_rules.Mien", "got my_rules.Mien, and my_rules has no Mien. Did you mean `Mine`?"),
+        ("my_rules.Other", "got my_rules.Other, which is not derived from it."),
+        ("my_rules.Unfinished", "which does not define budget, select."),
+        ("my_broken.Mine", "which cannot be imported: NameError: name 'nothing' is not defined (my_broken.py, line 1)"),
+        ("Nobody", "got Nobody. Write `package.module.Class`."),
+        ("{class_path: my_rules.Mine, init_args: {spacing: x}}", "refine.spacing: expected a whole number, got x."),
+        ("{class_path: my_rules.Mine, init_args: {spacng: 4}}", "Did you mean `spacing`?"),
+        ("my_rules.Mine", "which refused: ValueError: no spacing is right (my_rules.py, line 7)"),
+    ],
+)
+def test_a_class_that_cannot_be_a_selector_is_said_to_be_missing_or_what_else_is_wrong(
+    named, said, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+    (tmp_path / "my_rules.py").write_text(RULES)
+    (tmp_path / "my_broken.py").write_text("nothing")
+    content = f"model: {{policy: {{init_args: {{refine: {named}}}}}}}"
+    (tmp_path / "mine.yaml").write_text(content)
+    assert main(["fit", "--config", "smoke", "--config", "mine.yaml"]) == 2
+    told = capsys.readouterr().err
+    assert said in told
+    assert "Traceback" not in told
+
+
 def test_includes_come_first_and_are_relative_to_the_file(tmp_path):
     (tmp_path / "deep").mkdir()
     (tmp_path / "a.yaml").write_text("include: deep/b.yaml\n")

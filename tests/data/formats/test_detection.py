@@ -101,8 +101,8 @@ def test_what_is_not_recognised_is_described(case, tmp_path):
         detect(tmp_path)
 
 
-def test_a_folder_that_does_not_exist_says_so_beside_all_formats(tmp_path):
-    with pytest.raises(DataError, match=r"robotwin \(`joint_action.*got nothing there"):
+def test_a_folder_that_does_not_exist_says_so_and_nothing_of_formats(tmp_path):
+    with pytest.raises(DataError, match="nowhere: expected demonstrations, got nothing there"):
         detect(tmp_path / "nowhere")
 
 

@@ -18,7 +18,7 @@ from ugr_lightning.models.refine.head import Head
 from ugr_lightning.models.refine.oracle import Oracle
 from ugr_lightning.models.refine.prior import Prior
 from ugr_lightning.models.refine.scattered import Scattered
-from ugr_lightning.models.refine.selector import Selector
+from ugr_lightning.models.refine.selector import Selector, checked_budget
 from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 
@@ -124,6 +124,56 @@ def test_is_rebuilt_from_its_blueprint(kind):
     again = rebuild(build(kind).blueprint())
     assert type(again) is kind
     assert torch.equal(again.select(scores(), whole(), False), build(kind).select(scores(), whole(), False))
+
+
+@every_selector
+@pytest.mark.parametrize("steps", [STEPS, 13])
+def test_keeps_its_promises_and_leaves_the_random_state_alone(kind, steps, monkeypatch):
+    monkeypatch.setitem(ARGUMENTS, Prior, {"errors": [float(k % 7) for k in range(steps)]})
+    selector, state = build(kind), torch.get_rng_state()
+    assert checked_budget(selector, steps, uncertain=True) == selector.budget(steps)
+    assert torch.equal(state, torch.get_rng_state())
+
+
+class Mine(Selector):
+    """A rule of a user's, given as a function."""
+
+    def __init__(self, budget: int | None = 5) -> None:
+        super().__init__()
+        self.steps = budget
+
+    def budget(self, chunk_length):
+        return self.steps
+
+    def select(self, log_variance, valid, training):
+        return self.rule(log_variance, valid)
+
+
+FIRST = torch.arange(10) < 5
+
+
+@pytest.mark.parametrize(
+    ("rule", "complaint"),
+    [
+        (lambda s, valid: (FIRST & valid).float(), r"Mine.select: expected bool \(2, 10\), .* got float32 \(2, 10\)"),
+        (lambda s, valid: FIRST, r"got bool \(10,\)\. Return a truth value for each step of each sample"),
+        (lambda s, valid: None, "got None"),
+        (lambda s, valid: s > 0, r"got TypeError: .*test_selectors.*`needs_uncertainty = True`"),
+        (lambda s, valid: valid.clone(), "expected 5 chosen steps in every chunk, as `budget` promises, got 10"),
+        (lambda s, valid: FIRST.expand(valid.shape) & valid | ~valid, "expected no padded step chosen, got 5 of them"),
+        (lambda s, valid: torch.rand(valid.shape).argsort(1) < 5, "expected the same choice whenever it is asked"),
+    ],
+)
+def test_a_rule_that_breaks_a_promise_is_refused_in_a_sentence(rule, complaint, monkeypatch):
+    monkeypatch.setattr(Mine, "rule", staticmethod(rule), raising=False)
+    with pytest.raises(ConfigError, match=complaint):
+        checked_budget(Mine(), 10, uncertain=False)
+
+
+@pytest.mark.parametrize("budget", [11, 2.5])
+def test_a_budget_that_is_no_number_of_steps_is_refused(budget):
+    with pytest.raises(ConfigError, match=rf"Mine.budget: expected a whole number of steps up to 10.*got {budget}"):
+        checked_budget(Mine(budget), 10, uncertain=False)
 
 
 def test_full_chooses_all_valid_steps():

@@ -4,7 +4,11 @@ import difflib
 import importlib
 import inspect
 import re
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import fields, is_dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,7 @@ import yaml
 from jsonargparse import ArgumentParser
 
 from ugr_lightning.errors import ConfigError, UGRError
+from ugr_lightning.system.workers import describe_error
 
 
 def expand_includes(argv: Sequence[str]) -> list[str]:
@@ -120,12 +125,13 @@ def run_name(argv: Sequence[str]) -> str:
     return "-".join(names) or "run"
 
 
-def explain(error: Exception, parser: ArgumentParser | None) -> UGRError:
+def explain(error: Exception, parser: ArgumentParser | None, argv: Sequence[str] = ()) -> UGRError:
     """Turn a parser's error into one paragraph that names the key and what was probably meant.
 
     Args:
         error: what the parser raised; where that was because a class refused its arguments in our words, these hold.
         parser: the parser of the subcommand, for the keys it knows.
+        argv: command line, includes expanded, for the configs that were given.
     """
     cause: BaseException | None = error
     while cause is not None:
@@ -147,15 +153,88 @@ def explain(error: Exception, parser: ArgumentParser | None) -> UGRError:
     if not unknown:
         keys = re.findall(r"[Kk]ey \"([\w.\-]+)\": ", message)
         told = message.rpartition(f'"{keys[-1]}": ')[2] if keys else message
+        if "Subtypes" not in told:  # behind it comes what a union around this key could be as well
+            told = re.split(r"(?<=\S) - Expected", told)[0]
         where = ".".join(keys) or "configuration"
-        return ConfigError(where, *_wanted(told), "Correct the value.")
+        return ConfigError(where, *(_refused_class(told, error) or (*_wanted(told), "Correct the value.")))
     key = unknown[-1]
     known = set(_known_keys(parser, message))
     near = difflib.get_close_matches(key, known, n=3) or difflib.get_close_matches(
         key.rpartition(".")[2], {k.rpartition(".")[2] for k in known}, n=3
     )
     fix = f"Did you mean {_either(near)}?" if near else "`--help` and `--print_config` list the keys."
+    fix = _overlay_for_another(key, argv) or fix
     return ConfigError(key, "a known key", "an unknown one" + _context(message, key), fix)
+
+
+def _overlay_for_another(key: str, argv: Sequence[str]) -> str | None:
+    """Which config to give in place of one that sets a key for another policy: one beside it, named as one given."""
+    given = [Path(value) for flag, value in pairwise(argv) if flag == "--config"]
+    names = {path.resolve(): name for name, path in config_names().items()}
+    for path in given:
+        keys = {one.rpartition(".")[2] for one in flat(yaml.safe_load(path.read_text()) or {})}
+        for other in given if key.rpartition(".")[2] in keys else ():
+            meant = path.with_name(other.name)
+            if meant.is_file() and meant not in given:
+                ours, theirs = (names.get(one.resolve(), one) for one in (meant, path))
+                return f"`{theirs}` sets it: did you mean `--config {ours}`?"
+    return None
+
+
+_NAMED = (
+    r"(?:Expected a path but |class_path '|Import path (?=\S+ does)"
+    r"|Given value: (?:\{'class_path': '|Namespace\(class_path=')?)([\w.]+)"
+)
+
+
+def _refused_class(told: str, error: BaseException) -> tuple[str, str, str] | None:
+    """Expected, got and advice where a key takes an object and what was named is no such class; None for other keys."""
+    union = re.search(r"Subtypes: \[(.*?)\] Errors: ", told)
+    choices = [_imported(path) for path in re.findall(r"<class '([\w.]+\.\w+)'>", union[1])] if union else []
+    choices = [kind for kind in choices if isinstance(kind, type) and not issubclass(kind, (Path, int, float, str))]
+    settings = [field.name for kind in choices if is_dataclass(kind) for field in fields(kind)]
+    kinds = [kind.__name__ for kind in choices if not is_dataclass(kind)]
+    if union is None:
+        kinds = re.findall(r"subclass of (\w+)", told)
+    named = re.search(_NAMED, told)
+    if named is not None and settings and not kinds:
+        return f"a mapping of {', '.join(settings)}, or null", named[1], "`--print_config` shows one."
+    if named is None or not (kinds or (union is None and "class_path" in told)):
+        return None
+    path = named[1]
+    module, _, name = path.rpartition(".")
+    expected = " or ".join(f"the path of a {kind}" for kind in kinds or ["class"])
+    expected += " or null" if union and "NoneType" in union[1] else ""
+    found = _imported(path)
+    if not module:
+        return expected, path, "Write `package.module.Class`."
+    if isinstance(found, ModuleNotFoundError) and f"{module}.".startswith(f"{found.name}."):
+        fix = "Correct it; modules are found in the folder in which `ugr` runs, and on PYTHONPATH."
+        return expected, f"{path}, and there is no module {found.name}", fix
+    if isinstance(found, AttributeError) and module in sys.modules:
+        near = difflib.get_close_matches(name, vars(sys.modules[module]), n=3)
+        fix = f"Did you mean {_either(near)}?" if near else "Correct the name."
+        return expected, f"{path}, and {module} has no {name}", fix
+    if isinstance(found, Exception):
+        return expected, f"{path}, which cannot be imported: {describe_error(found)}", "Correct the file."
+    if "does not correspond to a subclass" in told or not isinstance(found, type):
+        return expected, f"{path}, which is not derived from it", "Derive it, or name another class."
+    if inspect.isabstract(found):
+        lacking = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
+        return expected, f"{path}, which does not define {lacking}", "Define what is missing."
+    while error.__cause__ is not None:
+        error = error.__cause__
+    got = describe_error(error) if isinstance(error, Exception) else str(error)
+    return expected, f"{path}, which refused: {got}", "Correct the class, or what it is given."
+
+
+def _imported(path: str) -> Any:
+    """What a dotted path names, or the exception that says why there is nothing."""
+    module, _, name = path.rpartition(".")
+    try:
+        return getattr(importlib.import_module(module), name)
+    except Exception as error:  # whatever a user's file raises
+        return error
 
 
 _IN_WORDS = {
@@ -197,13 +276,9 @@ def _context(message: str, key: str) -> str:
 def _known_keys(parser: ArgumentParser | None, message: str) -> Iterator[str]:
     if parser is not None:
         yield from (action.dest for action in parser._actions if action.dest)
-    for path in re.findall(r"\bugr_lightning(?:\.\w+)+", message):
-        module, _, name = path.rpartition(".")
-        try:
-            found = getattr(importlib.import_module(module), name)
-            yield from (parameter for parameter in inspect.signature(found).parameters)
-        except (ImportError, AttributeError, TypeError, ValueError):
-            continue  # the message named something that is no class of ours
+    for path in re.findall(r"\bugr_lightning(?:\.\w+)+|(?<=class_path ')[\w.]+", message):
+        with suppress(TypeError, ValueError):  # the message named something that is no class
+            yield from inspect.signature(_imported(path)).parameters
 
 
 def _either(names: Sequence[str]) -> str:

@@ -237,9 +237,11 @@ def detect(folder: Path) -> EpisodeFormat:
     """The format of a folder of demonstrations.
 
     Raises:
-        DataError: no format recognises it, or several do.
+        DataError: nothing is there, no format recognises it, or several do.
     """
     folder = Path(folder)
+    if not folder.exists():
+        raise DataError(folder, "demonstrations", "nothing there", "Check the path, or record with `ugr collect`.")
     found = recognise(folder)
     if len(found) == 1:
         return found[0]
@@ -251,8 +253,6 @@ def detect(folder: Path) -> EpisodeFormat:
 
 
 def _what_is_there(folder: Path) -> str:
-    if not folder.exists():
-        return "nothing there"
     for path in episode_files(folder).values():
         try:
             with open_hdf5(path) as file:
