@@ -66,6 +66,15 @@ def test_a_training_that_fails_before_its_first_step_is_done_leaves_no_folder(ti
     assert not list(Path("runs").iterdir())
 
 
+def test_a_training_looks_how_its_demonstrations_were_recorded(tiny_config, tmp_path, capsys):
+    root = tmp_path / "noisy"
+    record(root, steps=12, longer=0, size=(8, 12))
+    (folder,) = {path.parents[1] for path in root.rglob("*.hdf5")}
+    (folder / "recording.json").write_text('{"noise": {"std": 0.3}}')
+    assert main(["fit", "--config", tiny_config, "--data.root", str(root), "--data.recording.noise_std", "0.1"]) == 2
+    assert "expected a recording with `data.recording` noise_std 0.1, got noise_std 0.3" in capsys.readouterr().err
+
+
 def test_two_fits_with_the_same_seed_agree_bit_for_bit_and_loader_workers_change_nothing(tiny_config):
     fit(tiny_config)
     fit(tiny_config, "--data.num_workers", "2", "--run", "parallel")
