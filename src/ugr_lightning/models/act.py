@@ -282,8 +282,9 @@ class ACT(TokenPolicy):
     ) -> Plan:
         """From inputs in network units to a chunk in network units; the paper's Eq. (2) to (5) in order."""
         with autocast(self.precision, state.device):
-            looked = self.look(self.backbone, self.pictures(observation).flatten(0, 2), len(self.cameras))
-            sighting = self.find_keyframes(looked, observation.projection, observation.state, labels)
+            pictures = self.pictures(observation).flatten(0, 1)  # (B, V, 3, H, W)
+            looked = self.look(self.backbone, pictures.flatten(0, 1), len(self.cameras))
+            sighting = self.find_keyframes(looked, pictures, observation.projection, observation.state, labels)
             token = self.keyframe_token(sighting)  # (B, 1, D)
             memory, position = self.tokens(looked, state, latent, token, blind)  # (B, N, D), (N, D)
             for layer in self.encoder:

@@ -232,12 +232,13 @@ class DiffusionPolicy(PicturePolicy):
             state, projection = state[:, None], None if projection is None else projection[:, None]
         size, steps = images.shape[:2]
         with autocast(self.precision, images.device):
-            looked, features = self._see(images.flatten(0, 1))  # (B T, V F)
+            frames = images.flatten(0, 1)  # (B T, V, 3, H, W)
+            looked, features = self._see(frames)  # (B T, V F)
             if projection is not None:
                 projection = projection.flatten(0, 1)  # (B T, V, 3, 4)
             if labels is not None:
                 labels = Keyframes(*(part.repeat_interleave(steps, dim=0) for part in labels))
-            sighting = self.find_keyframes(looked, projection, state.flatten(0, 1), labels)
+            sighting = self.find_keyframes(looked, frames, projection, state.flatten(0, 1), labels)
         state, blind = self.disturb(self.normalizer.state(state))  # (B, T, S), (B,)
         parts = [features.float().reshape(size, -1), state.flatten(1)]  # (B, ...) each
         if blind is not None:

@@ -14,6 +14,7 @@ from torch.nn import functional
 from ugr_lightning.contract import Keyframes, Statistics
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.precision import full_precision
+from ugr_lightning.models.zoom import NEAR, Zoom
 
 ARMS, POINTS, AXES = 2, 2, 6
 """Left and right; the tool and its foot on the table; numbers of two axes."""
@@ -23,8 +24,6 @@ SHY = 7.0
 """First log-odds of `not in this picture`; a map of 1200 equal cells has log 1200 = 7.1 against one cell."""
 AXES_NOISE = 0.03
 """Standard deviation, in training, of the noise on the axes that the policy is told."""
-NEAR = 0.02
-"""A point nearer to a camera's plane, m, is not in its picture."""
 AGREES = 0.025
 """A ray that misses the point by so much of half a picture, two pixels of 160, counts for a quarter."""
 
@@ -40,6 +39,8 @@ class KeyframeSettings:
         table_height: height of the table in the world, m, where the foot of a tool is.
         context: dilations of further convolutions of the maps' features, which see farther around.
         grips: tell the maps how open the grippers are: whether one has let go already, a picture hardly shows.
+        zoom: pixels on a side of the crops in which a second look corrects what the maps find; 0 for none.
+        displaced: standard deviation, m, of what the second look learns to correct.
     """
 
     channels: int = 64
@@ -48,6 +49,12 @@ class KeyframeSettings:
     table_height: float = 0.0
     context: tuple[int, ...] = ()
     grips: bool = False
+    zoom: int = 0
+    displaced: float = 0.015
+
+    def __post_init__(self) -> None:
+        if self.zoom < 0 or self.zoom % 8:
+            raise ConfigError("keyframes.zoom", "0 or a multiple of 8 pixels", self.zoom, "Use 0, or 32.")
 
 
 class Sighting(NamedTuple):
@@ -89,7 +96,8 @@ class KeyframeFinder(nn.Module):
         self.grips = nn.Linear(ARMS, channels) if settings.grips else None
         self.maps = nn.Conv2d(channels, maps, 1)
         self.absent = nn.Linear(2 * channels, maps)
-        self.axes = nn.Linear(POINTS * channels, AXES)
+        self.zoom = Zoom(settings.zoom, cameras, AXES) if settings.zoom else None
+        self.axes = nn.Linear(POINTS * channels, AXES) if self.zoom is None else None
         self.register_buffer("centre", torch.zeros(ARMS, 3))
         self.register_buffer("spread", torch.ones(ARMS, 3))
 
@@ -110,7 +118,9 @@ class KeyframeFinder(nn.Module):
         projection: Tensor,
         shift: Tensor,
         grips: Tensor,
+        pictures: Tensor,
         labels: Keyframes | None = None,
+        jitter: float = 0.0,
     ) -> Sighting:
         """Find the keyframes of both arms.
 
@@ -119,40 +129,64 @@ class KeyframeFinder(nn.Module):
             projection: (B, V, 3, 4), see `embodiment.image_projection`.
             shift: (B V, 2) how far each picture was moved, in image units.
             grips: (B, 2) how open the grippers are, normalised.
+            pictures: (B, V, 3, H, W) uint8, as they were before they were moved.
             labels: what is to be found, in training and validation.
+            jitter: largest random relative change of a crop's contrast and brightness.
         """
         cameras = projection.shape[1]
         features = self._features(stages, cameras, grips)  # (B V, C, h, w)
         chances = self._chances(features)  # (B V, 4, h w + 1) float32, logarithms
         with full_precision(features.device):  # millimetres need all digits
-            return self._sighting(features.float(), chances, projection, shift, labels)
+            cameras, (height, width) = projection.shape[1], features.shape[2:]
+            maps = chances[..., :-1].exp().unflatten(2, (height, width))  # (B V, 4, h, w)
+            place, mass, window = peak(maps)  # (B V, 4, ...)
+            terms: dict[str, Tensor] = {}
+            if labels is not None:
+                terms = self._terms(chances, place, shift, projection, labels, (height, width))
+            points, doubts = self._points(place, mass, shift, projection)  # (B, 2, 3) each
+            if self.zoom is None:
+                axes = self._axes(features.float(), window, cameras)  # (B, 2, 6)
+            else:
+                if self.training and labels is not None:  # what the maps find on training scenes is too good
+                    points = labels.position + self.settings.displaced * torch.randn_like(points)
+                closer = self.zoom(pictures, projection, points, self._normalised(points), grips, jitter)
+                if labels is not None:
+                    wanted = (labels.position - points) / self.settings.displaced  # (B, 2, 3)
+                    miss = functional.smooth_l1_loss(closer.correction, wanted, beta=0.25)
+                    terms["keyframe"] = terms["keyframe"] + miss
+                points = points + self.settings.displaced * closer.correction.detach()
+                axes = closer.axes
+            if labels is not None:
+                terms["keyframe"] = terms["keyframe"] + 3 * (axes - labels.axes).abs().mean()
+                terms["keyframe_mm"] = 1000 * (points - labels.position).norm(dim=-1).median()
+            axes = axes.detach()
+            if self.training and self.settings.noise:
+                axes = axes + AXES_NOISE * torch.randn_like(axes)
+            summary = torch.cat([self._normalised(points), doubts, axes], dim=-1).flatten(1)  # (B, 2 FEATURES)
+            maps = maps.detach().unflatten(0, (-1, cameras)).unflatten(2, (ARMS, POINTS))  # (B, V, 2, 2, h, w)
+            return Sighting(summary, maps, self._with_feet(points), terms)
 
-    def _sighting(
-        self, features: Tensor, chances: Tensor, projection: Tensor, shift: Tensor, labels: Keyframes | None
-    ) -> Sighting:
-        cameras, (height, width) = projection.shape[1], features.shape[2:]
-        maps = chances[..., :-1].exp().unflatten(2, (height, width))  # (B V, 4, h, w)
-        place, mass, window = peak(maps)  # (B V, 4, ...)
-        around = window[::cameras].flatten(2) @ features[::cameras].flatten(2).transpose(1, 2)  # (B, 4, C), one camera
-        axes = self.axes(around.unflatten(1, (ARMS, POINTS)).flatten(2))  # (B, 2, 6)
-        terms: dict[str, Tensor] = {}
-        if labels is not None:
-            terms = self._terms(chances, place, shift, projection, labels, (height, width))
-            terms["keyframe"] = terms["keyframe"] + 3 * (axes - labels.axes).abs().mean()
-        told, axes = (place + shift[:, None]).detach(), axes.detach()  # (B V, 4, 2), in the picture as it was
+    def _points(self, place: Tensor, mass: Tensor, shift: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:
+        """Points (B, 2, 3) in m that the maps' peaks agree on, and (B, 2, 3) how well they do; without gradient."""
+        told = (place + shift[:, None]).detach()  # (B V, 4, 2), in the picture as it was
         if self.training and self.settings.noise:
             told = told + self.settings.noise * torch.randn_like(told)
-            axes = axes + AXES_NOISE * torch.randn_like(axes)
-        shape = (-1, cameras, ARMS, POINTS)
+        shape = (-1, projection.shape[1], ARMS, POINTS)
         mass = mass.detach() * (told.abs().amax(-1) < 1)  # (B V, 4); shifted out of the picture, nothing is known
         points, misses, support = self.solve(told.view(*shape, 2), mass.view(shape), projection)
-        if labels is not None:
-            terms["keyframe_mm"] = 1000 * (points - labels.position).norm(dim=-1).median()
-        where = (points - self.centre) / self.spread  # (B, 2, 3)
         sure = mass.view(shape).mean((1, 3))  # (B, 2)
         doubts = torch.stack([(misses / AGREES).clamp(max=3), support.clamp(min=1e-6).log() / 3, sure], -1)  # (B, 2, 3)
-        summary = torch.cat([where, doubts, axes], dim=-1).flatten(1)  # (B, 2 FEATURES)
-        return Sighting(summary, maps.detach().view(*shape, height, width), self._with_feet(points), terms)
+        return points, doubts
+
+    def _axes(self, features: Tensor, window: Tensor, cameras: int) -> Tensor:
+        """Orientations (B, 2, 6), read where the first camera's maps are high."""
+        assert self.axes is not None
+        around = window[::cameras].flatten(2) @ features[::cameras].flatten(2).transpose(1, 2)  # (B, 4, C)
+        axes: Tensor = self.axes(around.unflatten(1, (ARMS, POINTS)).flatten(2))
+        return axes
+
+    def _normalised(self, points: Tensor) -> Tensor:
+        return (points - self.centre) / self.spread  # (B, 2, 3)
 
     def _with_feet(self, points: Tensor) -> Tensor:
         """Tools (B, 2, 3) and their feet on the table, (B, 2, 2, 3)."""

@@ -173,12 +173,13 @@ class PicturePolicy(ChunkPolicy):
         return Looked(backbone(x), shift)
 
     def find_keyframes(
-        self, looked: Looked, projection: Tensor | None, state: Tensor, labels: Keyframes | None
+        self, looked: Looked, pictures: Tensor, projection: Tensor | None, state: Tensor, labels: Keyframes | None
     ) -> Sighting | None:
         """The hands' next keyframes, where the policy looks for them.
 
         Args:
             looked: what the backbone makes of the pictures.
+            pictures: (B, V, 3, H, W) uint8, as they were before they were moved.
             projection: (B, V, 3, 4); None without calibration.
             state: (B, S) robot units, of which the grippers are told; never hidden.
             labels: what is to be found, in training and validation.
@@ -193,7 +194,9 @@ class PicturePolicy(ChunkPolicy):
         first, second, third, _ = looked.stages
         joints = self.normalizer.state(state)  # (B, S)
         grips = torch.stack([joints[:, place] for place in last_of_each_arm(state.shape[1])], 1)  # (B, 2)
-        sighting: Sighting = self.finder((first, second, third), projection, looked.shift, grips, labels)
+        jitter = self.color_jitter if self.training else 0.0
+        stages = (first, second, third)
+        sighting: Sighting = self.finder(stages, projection, looked.shift, grips, pictures, labels, jitter)
         return sighting
 
     def lesson(self, terms: dict[str, Tensor], sighting: Sighting | None) -> dict[str, Tensor]:
@@ -223,7 +226,7 @@ class PicturePolicy(ChunkPolicy):
         device = self.normalizer.state_shift.device
         with autocast(self.precision, device):
             if torch.is_autocast_enabled(device.type):
-                store_weights_as(fast, torch.bfloat16, keep=(*self.exact, "finder.axes"))
+                store_weights_as(fast, torch.bfloat16, keep=(*self.exact, "finder.axes", "finder.zoom"))
         return fast
 
     @contextmanager

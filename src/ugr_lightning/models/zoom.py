@@ -1,0 +1,121 @@
+"""A second look: the pixels around where the maps have found a hand's next keyframe, as fine as they are."""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional
+
+from ugr_lightning.models.augmentation import jitter_colour
+
+FARTHEST = 3.0
+"""The largest correction, in standard deviations of the displacement in training."""
+NEAR = 0.02
+"""A point nearer to a camera's plane, m, is not in its picture."""
+EDGE = 1.2
+"""Where a crop's middle may be, in image units; 1 is the edge of the picture."""
+
+
+class Closer(NamedTuple):
+    """What the second look gives.
+
+    Args:
+        correction: (B, 2, 3) from the points that were looked at to those that are meant, in standard deviations of the
+            displacement in training.
+        axes: (B, 2, axes) which way round the tools are.
+    """
+
+    correction: Tensor
+    axes: Tensor
+
+
+class Zoom(nn.Module):
+    """Corrects a point of each arm, and reads its orientation, in crops of all pictures around the point.
+
+    A backbone sees cells of several pixels, and a whole scene: it is slow to learn what a few pixels decide. A crop
+    around the place in question holds little else. In training the points are the true ones, displaced at random, so
+    that only the pictures can say by how much.
+
+    Args:
+        side: S, pixels of a crop, a multiple of 8.
+        cameras: V.
+        axes: numbers that tell an orientation.
+        channels: of the first of four layers.
+
+    Source: RVT-2 (arXiv:2406.08545) looks a second time where a coarse stage points; docs/recipe.md (the second look).
+    """
+
+    def __init__(self, side: int, cameras: int, axes: int, channels: int = 24) -> None:
+        super().__init__()
+        self.side, wide, told = side, 2 * channels, 64
+        self.eyes = nn.ModuleList(
+            nn.Sequential(
+                *_layer(3, channels, 1),
+                *_layer(channels, wide, 2),
+                *_layer(wide, wide, 2),
+                *_layer(wide, wide, 2),
+                nn.Flatten(),
+                nn.Linear(wide * (side // 8) ** 2, told),
+            )
+            for _ in range(cameras)
+        )
+        known = (told + 1) * cameras + 3 + 2  # what each camera sees and whether; where; both grippers
+        self.hands = nn.ModuleList(
+            nn.Sequential(nn.Linear(known, 2 * told), nn.ReLU(), nn.Linear(2 * told, 3 + axes)) for _ in range(2)
+        )
+
+    def forward(
+        self, pictures: Tensor, projection: Tensor, points: Tensor, where: Tensor, grips: Tensor, jitter: float = 0.0
+    ) -> Closer:
+        """Look at both arms' points.
+
+        Args:
+            pictures: (B, V, 3, H, W) uint8.
+            projection: (B, V, 3, 4) of the pictures as they are.
+            points: (B, 2, 3) m, where to look.
+            where: (B, 2, 3) the same, normalised.
+            grips: (B, 2) how open the grippers are, normalised.
+            jitter: largest random relative change of contrast and brightness.
+        """
+        crops, inside = crop(pictures, projection, points, self.side)  # (B, V, 2, 3, S, S), (B, V, 2)
+        if jitter:
+            crops = jitter_colour(crops.flatten(0, 2), jitter, crops.shape[1] * crops.shape[2]).view_as(crops)
+        crops = crops * inside[..., None, None, None]
+        seen = [eye(crops[:, camera].flatten(0, 1)).unflatten(0, (-1, 2)) for camera, eye in enumerate(self.eyes)]
+        told = [*seen, inside.transpose(1, 2).to(where.dtype), where, grips[:, None].expand(-1, 2, -1)]
+        known = torch.cat(told, dim=-1)  # (B, 2, known)
+        answers = torch.stack([hand(known[:, arm]) for arm, hand in enumerate(self.hands)], dim=1)  # (B, 2, 3 + axes)
+        correction, axes = answers[..., :3], answers[..., 3:]
+        return Closer(correction if self.training else correction.clamp(-FARTHEST, FARTHEST), axes)
+
+
+def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int) -> tuple[Tensor, Tensor]:
+    """Squares of pixels around points of the world, in every picture.
+
+    Args:
+        pictures: (B, V, 3, H, W) uint8.
+        projection: (B, V, 3, 4).
+        points: (B, n, 3) m.
+        side: S.
+
+    Returns:
+        (B, V, n, 3, S, S) float32, -1 to 1, borders repeated; (B, V, n) whether a point is in or near the picture.
+    """
+    count, (height, width) = points.shape[1], pictures.shape[3:]
+    matrix, offset = projection[:, :, None, :, :3], projection[:, :, None, :, 3]
+    seen = (matrix @ points[:, None, ..., None]).squeeze(-1) + offset  # (B, V, n, 3)
+    depth = seen[..., 2]
+    middle = seen[..., :2] / depth.clamp(min=NEAR)[..., None]  # (B, V, n, 2) u, v in image units
+    inside = (depth > NEAR) & (middle.abs().amax(-1) < EDGE)
+    steps = torch.arange(side, device=points.device) + 0.5 - side / 2  # (S,) pixels
+    u = (middle[..., :1] + 2 / width * steps)[..., None, :].expand(*middle.shape[:3], side, side)
+    v = (middle[..., 1:] + 2 / height * steps)[..., None].expand(*middle.shape[:3], side, side)
+    grid = torch.stack([u, v], dim=-1).flatten(0, 1).flatten(1, 2)  # (B V, n S, S, 2)
+    pixels = pictures.flatten(0, 1).float() / 127.5 - 1  # (B V, 3, H, W)
+    squares = functional.grid_sample(pixels, grid, padding_mode="border", align_corners=False)  # (B V, 3, n S, S)
+    squares = squares.unflatten(2, (count, side)).unflatten(0, (-1, pictures.shape[1]))  # (B, V, 3, n, S, S)
+    return squares.transpose(2, 3), inside
+
+
+def _layer(inputs: int, outputs: int, stride: int) -> tuple[nn.Module, ...]:
+    return nn.Conv2d(inputs, outputs, 3, stride, 1, bias=False), nn.BatchNorm2d(outputs), nn.ReLU()
