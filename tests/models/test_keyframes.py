@@ -13,6 +13,7 @@ from ugr_lightning.models.mirror import mirror_batch, mirror_joints, mirrored_st
 
 HEIGHT, WIDTH = 48, 64
 GRIPS = torch.zeros(2, 2)
+DARK = torch.zeros(2, 3, 3, HEIGHT, WIDTH, dtype=torch.uint8)
 
 
 def looking(eye, target):
@@ -136,11 +137,11 @@ def test_maps_learn_a_place_and_moving_the_picture_moves_the_label(finder, proje
     optimiser = torch.optim.Adam(finder.parameters(), 1e-2)
     for _ in range(120):
         finder.train()
-        terms = finder(stages, projection, shift, GRIPS, keyframes).terms
+        terms = finder(stages, projection, shift, GRIPS, DARK, keyframes).terms
         optimiser.zero_grad()
         terms["keyframe"].backward()
         optimiser.step()
-    found = finder.eval()(stages, projection, shift, GRIPS, keyframes)
+    found = finder.eval()(stages, projection, shift, GRIPS, DARK, keyframes)
     assert found.terms["keyframe_px"] < 4  # a cell
     expected, inside = places_of(keyframes, projection)
     seen = inside & (moved.unflatten(0, (2, 3)).abs().amax(-1) < 1)
@@ -163,10 +164,10 @@ def test_the_same_pictures_mean_another_place_once_a_gripper_has_let_go(projecti
     for _ in range(100):
         optimiser.zero_grad()
         for grip, labels in ((closed, keyframes), (opened, after)):
-            finder(stages, projection, shift, grip, labels).terms["keyframe"].backward()
+            finder(stages, projection, shift, grip, DARK, labels).terms["keyframe"].backward()
         optimiser.step()
     errors = [
-        finder(stages, projection, shift, grip, labels).terms["keyframe_px"].item()
+        finder(stages, projection, shift, grip, DARK, labels).terms["keyframe_px"].item()
         for grip, labels in ((closed, keyframes), (opened, after))
     ]
     assert (max(errors) < 2) == grips
@@ -185,10 +186,11 @@ def test_with_context_a_cell_sees_farther_around(projection):
     assert reach == {(): 3, (2, 4): 3 + 2 * 2 + 2 * 4}
 
 
+@pytest.mark.parametrize("zoom", [0, 16])
 @pytest.mark.parametrize("kind", ["act", "diffusion"])
-def test_a_policy_learns_with_keyframes_and_refuses_observations_without_calibration(tiny, seen, kind):
+def test_a_policy_learns_with_keyframes_and_refuses_observations_without_calibration(tiny, seen, kind, zoom):
     samples, statistics = seen
-    looks = KeyframeSettings(channels=8, context=(2,), grips=True)
+    looks = KeyframeSettings(channels=8, context=(2,), grips=True, zoom=zoom)
     settings = {"keyframes": looks, "mirror": 0.5, "image_dropout": 0.4, "state_dropout": 0.3}
     if kind != "diffusion":
         policy = tiny(backbone_stem="unshuffle", keypoints=2, image_shift=4, **settings)

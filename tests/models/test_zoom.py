@@ -1,0 +1,89 @@
+"""A second look around what the maps have found."""
+
+import pytest
+import torch
+
+from ugr_lightning.contract import Keyframes
+from ugr_lightning.errors import ConfigError
+from ugr_lightning.models.keyframes import KeyframeFinder, KeyframeSettings
+from ugr_lightning.models.zoom import FARTHEST, Zoom, crop
+
+HEIGHT, WIDTH = 24, 32
+ABOVE = torch.tensor([[1.0, 0, 0, 0], [0, -4 / 3, 0, 0], [0, 0, -1, 1]])
+"""A camera 1 m above the table that sees 2 m by 1.5 m of it (3, 4)."""
+SIDEWAYS = torch.tensor([[0.0, 1, 0, 0], [0, 0, -4 / 3, 0.4], [1, 0, 0, 1]])
+"""One that looks along x from x = -1 (3, 4)."""
+
+
+def blobs(points, projection):
+    """Pictures (B, V, 3, H, W) that are dark but where the points (B, 2, 3) are: red the left one, green the right."""
+    seen = (projection[:, :, None, :, :3] @ points[:, None, ..., None]).squeeze(-1) + projection[:, :, None, :, 3]
+    place = (seen[..., :2] / seen[..., 2:] + 1) / 2 * torch.tensor([WIDTH, HEIGHT]) - 0.5  # (B, V, 2, 2) pixels
+    rows, columns = torch.arange(HEIGHT)[:, None], torch.arange(WIDTH)
+    apart = (columns - place[..., 0, None, None]) ** 2 + (rows - place[..., 1, None, None]) ** 2
+    bright = 255 * torch.exp(-apart / 4)  # (B, V, 2, H, W)
+    return torch.cat([bright, torch.zeros_like(bright[:, :, :1])], dim=2).to(torch.uint8)
+
+
+def table(count):
+    """Projections (count, 2, 3, 4) and points on the table (count, 2, 3)."""
+    points = torch.rand(count, 2, 3) * torch.tensor([1.2, 0.9, 0.2]) - torch.tensor([0.6, 0.45, 0.0])
+    return torch.stack([ABOVE, SIDEWAYS]).expand(count, -1, -1, -1), points
+
+
+def test_a_crop_shows_the_pixels_around_a_point_and_repeats_the_border():
+    pictures = torch.arange(HEIGHT * WIDTH, dtype=torch.uint8).view(1, 1, 1, HEIGHT, WIDTH).expand(-1, -1, 3, -1, -1)
+    u, v = 20 * 2 / WIDTH - 1, 6 * 2 / HEIGHT - 1  # where pixels 19, 20 and rows 5, 6 meet
+    points = torch.tensor([[[u, -v * 3 / 4, 0.0], [1.0, -3 / 4, 0.0], [0.0, 0.0, 2.0]]])
+    squares, inside = crop(pictures, ABOVE[None, None], points, 8)
+    shown = ((squares + 1) * 127.5).round()
+    assert torch.allclose(shown[0, 0, 0], pictures[0, 0, :, 2:10, 16:24].float())
+    assert shown[0, 0, 1, 0, 4:, 4:].unique().tolist() == [pictures[0, 0, 0, -1, -1].item()]
+    assert inside.tolist() == [[[True, True, False]]]  # the third is behind the camera
+
+
+def test_it_learns_to_say_from_the_pictures_how_far_off_a_point_is():
+    torch.manual_seed(0)
+    zoom = Zoom(16, 2, 6, channels=8)
+    optimiser = torch.optim.Adam(zoom.parameters(), 3e-3)
+    for _ in range(150):
+        projection, points = table(32)
+        off = 0.08 * torch.randn_like(points)
+        answer = zoom(blobs(points, projection), projection, points + off, points + off, torch.zeros(32, 2))
+        loss = (answer.correction + off / 0.08).abs().mean()
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+    projection, points = table(200)
+    off = 0.08 * torch.randn_like(points)
+    zoom.eval()
+    answer = zoom(blobs(points, projection), projection, points + off, points + off, torch.zeros(200, 2))
+    left = off + 0.08 * answer.correction
+    assert left.square().mean().sqrt() < 0.4 * off.square().mean().sqrt()
+
+
+def test_what_it_has_learned_to_correct_limits_a_correction_outside_training():
+    torch.manual_seed(0)
+    zoom, (projection, points) = Zoom(8, 2, 6), table(2)
+    for hand in zoom.hands:
+        torch.nn.init.constant_(hand[-1].bias, 100.0)
+    arguments = (blobs(points, projection), projection, points, points, torch.zeros(2, 2))
+    assert zoom.train()(*arguments).correction.min() > 90
+    assert zoom.eval()(*arguments).correction.unique().tolist() == [FARTHEST]
+
+
+def test_outside_training_it_starts_from_what_the_maps_found_and_labels_change_nothing():
+    torch.manual_seed(0)
+    projection, points = table(2)
+    finder = KeyframeFinder(KeyframeSettings(channels=8, zoom=8), (8, 16, 32), 2).eval()
+    stages = (torch.rand(4, 8, 6, 8), torch.rand(4, 16, 3, 4), torch.rand(4, 32, 2, 2))
+    asked = (stages, projection, torch.zeros(4, 2), torch.zeros(2, 2), blobs(points, projection))
+    labels = Keyframes(points, torch.zeros(2, 2, 6), torch.ones(2, 2, dtype=torch.long))
+    assert torch.equal(finder(*asked).points, finder(*asked, labels).points)
+    finder.train()
+    assert not torch.allclose(finder(*asked).points, finder(*asked, labels).points)
+
+
+def test_a_crop_is_cut_into_eighths():
+    with pytest.raises(ConfigError, match="multiple of 8"):
+        KeyframeSettings(zoom=30)
