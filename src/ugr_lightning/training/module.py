@@ -20,9 +20,8 @@ from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.training.keyframe_error import MedianMetric, event_errors, known_kinematics
 from ugr_lightning.training.optimizer import MuonAndAdamW, Parts, parts_of
 
-
 FASTER = 3.0
-"""Steps of the keyframes' second look beside the backbone's; with as large ones it learns too little (docs/recipe.md)."""
+"""Steps of the second look in those of the backbone; with as large ones it learns too little (docs/recipe.md)."""
 
 
 class PolicyModule(LightningModule):
