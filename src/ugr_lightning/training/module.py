@@ -20,9 +20,6 @@ from ugr_lightning.models.checkpoint import describe
 from ugr_lightning.training.keyframe_error import MedianMetric, event_errors, known_kinematics
 from ugr_lightning.training.optimizer import MuonAndAdamW, Parts, parts_of
 
-FASTER = 3.0
-"""Steps of the second look in those of the backbone; with as large ones it learns too little (docs/recipe.md)."""
-
 
 class PolicyModule(LightningModule):
     """A policy in training: AdamW, a learning-rate schedule and the log.
@@ -30,8 +27,7 @@ class PolicyModule(LightningModule):
     Args:
         policy: the policy to train.
         learning_rate: peak step size of AdamW (paper, section IV-A: 1e-5).
-        backbone_learning_rate: step size of what sees (backbone, keyframes' maps; three times that for their second
-            look); null means `learning_rate`.
+        backbone_learning_rate: step size of what sees (backbone, keyframes' maps); null means `learning_rate`.
         muon_learning_rate: step size of Muon, which trains the matrices of transformer layers then (`learning_rate`
             times three is a good start); null means AdamW trains them as the rest.
         weight_decay: AdamW's decoupled weight decay.
@@ -184,9 +180,8 @@ class PolicyModule(LightningModule):
         Raises:
             ConfigError: as `parts`.
         """
-        acting, seeing, closer, mixing = self.parts()
-        rate = self.backbone_learning_rate
-        pairs = ((acting, self.learning_rate), (seeing, rate), (closer, FASTER * rate))
+        acting, seeing, mixing = self.parts()
+        pairs = ((acting, self.learning_rate), (seeing, self.backbone_learning_rate))
         groups = [{"params": part, "lr": rate} for part, rate in pairs if part]
         fused = not str(self.trainer.precision).endswith("-mixed")  # Lightning clips no gradients of a fused one then
         settings: Any = {"betas": self.betas, "weight_decay": self.weight_decay, "fused": fused}

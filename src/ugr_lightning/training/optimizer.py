@@ -13,8 +13,6 @@ LAYERS = (EncoderLayer, DecoderLayer, nn.TransformerEncoderLayer, nn.Transformer
 """Ours, and torch's in a policy of a user's own."""
 SEEING = ("backbone", "finder")
 """Words in the names of the parameters that see: the backbone and the keyframes' maps."""
-CLOSER = "finder.zoom."
-"""Where the names of the parameters begin that look a second time."""
 
 
 class Parts(NamedTuple):
@@ -23,13 +21,11 @@ class Parts(NamedTuple):
     Args:
         acting: all that is in no other part.
         seeing: the backbone and the keyframes' maps.
-        closer: the keyframes' second look, whose crops are small.
         mixing: the matrices of transformer layers that do not see, if they are Muon's.
     """
 
     acting: list[nn.Parameter]
     seeing: list[nn.Parameter]
-    closer: list[nn.Parameter]
     mixing: list[nn.Parameter]
 
 
@@ -42,16 +38,11 @@ def parts_of(policy: ChunkPolicy, *, muon: bool) -> Parts:
     """
     layers = [module for module in policy.modules() if isinstance(module, LAYERS)] if muon else []
     matrices = {id(parameter) for layer in layers for parameter in layer.parameters() if parameter.dim() == 2}
-    parts = Parts([], [], [], [])
+    parts = Parts([], [], [])
     for name, parameter in policy.named_parameters():
-        if not parameter.requires_grad:
-            continue
-        part = parts.mixing if id(parameter) in matrices else parts.acting
-        if name.startswith(CLOSER):
-            part = parts.closer
-        elif any(word in name for word in SEEING):
-            part = parts.seeing
-        part.append(parameter)
+        if parameter.requires_grad:
+            acts = parts.mixing if id(parameter) in matrices else parts.acting
+            (parts.seeing if any(word in name for word in SEEING) else acts).append(parameter)
     return parts
 
 
