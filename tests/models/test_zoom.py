@@ -87,3 +87,9 @@ def test_outside_training_it_starts_from_what_the_maps_found_and_labels_change_n
 def test_a_crop_is_cut_into_eighths():
     with pytest.raises(ConfigError, match="multiple of 8"):
         KeyframeSettings(zoom=30)
+
+
+@pytest.mark.parametrize("displaced", [0.0, -0.015, float("nan"), float("inf")])
+def test_a_displacement_is_a_distance(displaced):
+    with pytest.raises(ConfigError, match=r"keyframes\.displaced: expected a distance"):
+        KeyframeSettings(zoom=8, displaced=displaced)

@@ -4,6 +4,7 @@ A fully convolutional map that is classified per pixel learns at one place what 
 free: the calibration of the cameras projects the tool's pose at its next keyframe into every picture.
 """
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -55,6 +56,8 @@ class KeyframeSettings:
     def __post_init__(self) -> None:
         if self.zoom < 0 or self.zoom % 8:
             raise ConfigError("keyframes.zoom", "0 or a multiple of 8 pixels", self.zoom, "Use 0, or 32.")
+        if not 0 < self.displaced < math.inf:
+            raise ConfigError("keyframes.displaced", "a distance above 0, m", self.displaced, "Use 0.015.")
 
 
 class Sighting(NamedTuple):
