@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from deployed import looking_act, save
 from tiny import TinyPolicy, train
 
 from ugr_lightning.contract import Observation
@@ -99,6 +100,15 @@ def test_a_checkpoint_of_another_version_names_itself_and_both_versions(tmp_path
     torch.save(content, tmp_path / "later.ckpt")
     with pytest.raises(CheckpointError, match="format 1 or older, got another"):
         load_policy(tmp_path / "later.ckpt")
+
+
+@pytest.mark.parametrize("zoom", [-8, 4, 2.5])
+def test_a_checkpoint_with_a_setting_that_its_policy_refuses_names_itself(tmp_path, zoom):
+    content = torch.load(save(looking_act(), tmp_path / "whole.ckpt"), weights_only=True)
+    content["policy"]["blueprint"]["init_args"]["keyframes"]["zoom"] = zoom
+    torch.save(content, tmp_path / "changed.ckpt")
+    with pytest.raises(CheckpointError, match=rf"changed\.ckpt, .*{zoom}.* written by ugr-lightning"):
+        load_policy(tmp_path / "changed.ckpt")
 
 
 @pytest.mark.filterwarnings("ignore:Detected pickle protocol")

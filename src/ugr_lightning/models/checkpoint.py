@@ -14,7 +14,7 @@ import torch
 
 from ugr_lightning.blueprint import rebuild
 from ugr_lightning.contract import ChunkPolicy
-from ugr_lightning.errors import CheckpointError
+from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.policy_folder import folder_sha256, read_policy_folder
 from ugr_lightning.system.files import publish
 
@@ -183,7 +183,8 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
         The policy in evaluation mode (averaged weights where training averaged them), and what the file says.
 
     Raises:
-        CheckpointError: not such a file, unsafe, of a newer format, or made for other cameras.
+        CheckpointError: not such a file, unsafe, of a newer format, of a policy that cannot be, or made for other
+            cameras.
     """
     path = Path(path)
     content = read_policy_folder(path) if path.is_dir() else read_checkpoint(path, mmap=True)
@@ -193,7 +194,7 @@ def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> 
         raise CheckpointError(path, f"the cameras {sorted(cameras)}", sorted(description["cameras"]), fix)
     try:
         policy = rebuild(description["blueprint"])
-    except CheckpointError as error:
+    except (CheckpointError, ConfigError) as error:  # the latter of a constructor that was given what it refuses
         written, here = description["versions"].get("ugr-lightning"), versions()["ugr-lightning"]
         fix = f"{error.fix} The checkpoint was written by ugr-lightning {written}, this is {here}."
         raise CheckpointError(f"{path}, {error.where}", error.expected, error.got, fix) from error
