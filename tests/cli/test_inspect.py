@@ -1,4 +1,5 @@
 import torch
+from deployed import looking_act, save
 from PIL import Image
 
 from ugr_lightning.cli.main import main
@@ -17,6 +18,14 @@ def test_inspect_tells_what_things_are(recording, tiny_config, capsys, tmp_path)
     out = capsys.readouterr().out
     assert "tiny.TinyPolicy" in out
     assert "cam_left_wrist" in out
+
+
+def test_of_what_sees_only_the_statistics_of_the_demonstrations_are_shown(tmp_path, capsys):
+    assert main(["inspect", str(save(looking_act(), tmp_path / "looking.ckpt"))]) == 0
+    _, _, shown = capsys.readouterr().out.partition("buffers:\n")
+    assert {line.split(".")[0].strip() for line in shown.splitlines()} == {"normalizer", "finder"}
+    assert "finder.centre" in shown
+    assert "running" not in shown
 
 
 def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):

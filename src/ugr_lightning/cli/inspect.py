@@ -60,7 +60,9 @@ def _checkpoint(path: Path) -> list[str]:
         "statistics and other buffers:",
     ]
     return lines + [
-        f"  {name}: {_numbers(buffer)}" for name, buffer in policy.named_buffers() if "backbone" not in name
+        f"  {name}: {_numbers(buffer)}"
+        for name, buffer in policy.named_buffers()
+        if not any(part in name for part in ("backbone", "finder.zoom"))  # their layers' running statistics
     ]
 
 
