@@ -3,9 +3,10 @@
 import pytest
 import torch
 
-from ugr_lightning.contract import Keyframes
+from ugr_lightning.contract import CAMERAS, Keyframes
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.keyframes import KeyframeFinder, KeyframeSettings
+from ugr_lightning.models.mirror import mirror_batch
 from ugr_lightning.models.zoom import FARTHEST, Zoom, crop
 
 HEIGHT, WIDTH = 24, 32
@@ -40,6 +41,22 @@ def test_a_crop_shows_the_pixels_around_a_point_and_repeats_the_border():
     assert torch.allclose(shown[0, 0, 0], pictures[0, 0, :, 2:10, 16:24].float())
     assert shown[0, 0, 1, 0, 4:, 4:].unique().tolist() == [pictures[0, 0, 0, -1, -1].item()]
     assert inside.tolist() == [[[True, True, False]]]  # the third is behind the camera
+
+
+def test_crops_of_a_mirror_image_are_the_mirror_images_of_the_crops(batch):
+    _, points = table(3)
+    views = torch.stack([ABOVE, SIDEWAYS, ABOVE + 0.1 * SIDEWAYS]).expand(3, -1, -1, -1)
+    labels = Keyframes(points, torch.zeros(3, 2, 6), torch.ones(3, 2, dtype=torch.long))
+    samples = batch._replace(projection=views, keyframes=labels)
+    turned = mirror_batch(samples, torch.tensor([True, False, True]), CAMERAS)
+    (before, near), (after, still) = (
+        crop(one.images, one.projection, one.keyframes.position, 16) for one in (samples, turned)
+    )
+    assert near[::2].float().mean() > 0.5
+    assert torch.equal(after[1], before[1])
+    assert torch.equal(still[::2], near[::2, [0, 2, 1]].flip(2))
+    expected = before[::2, [0, 2, 1]].flip(2).flip(-1)  # the wrists change places, and so do the arms
+    assert torch.allclose(after[::2][still[::2]], expected[still[::2]], atol=1e-4)
 
 
 def test_it_learns_to_say_from_the_pictures_how_far_off_a_point_is():
