@@ -101,6 +101,25 @@ def test_outside_training_it_starts_from_what_the_maps_found_and_labels_change_n
     assert not torch.allclose(finder(*asked).points, finder(*asked, labels).points)
 
 
+def test_the_correction_moves_what_the_maps_found_and_its_axes_are_told():
+    torch.manual_seed(0)
+    projection, points = table(2)
+    finder = KeyframeFinder(KeyframeSettings(channels=8, zoom=8, displaced=0.01), (8, 16, 32), 2).eval()
+    stages = (torch.rand(4, 8, 6, 8), torch.rand(4, 16, 3, 4), torch.rand(4, 32, 2, 2))
+    asked = (stages, projection, torch.zeros(4, 2), torch.zeros(2, 2), blobs(points, projection))
+    answers = torch.tensor([[0.0, 0, 0, 1, 0, 0, 0, 1, 0], [2.0, 0, -1, 0, 1, 0, 0, 0, 1]])
+    found = []
+    for answer in answers:
+        for hand in finder.zoom.hands:
+            torch.nn.init.zeros_(hand[-1].weight)
+            hand[-1].bias.data.copy_(answer)
+        found.append(finder(*asked))
+    moved = (found[1].points - found[0].points)[:, :, 0]  # (2, 2, 3) of the tools
+    assert torch.allclose(moved, torch.tensor([0.02, 0, -0.01]).expand(2, 2, -1), atol=1e-6)
+    told = found[1].features.unflatten(1, (2, -1))
+    assert torch.equal(told[..., -6:], answers[1, 3:].expand(2, 2, -1))
+
+
 def test_a_crop_is_cut_into_eighths():
     with pytest.raises(ConfigError, match="multiple of 8"):
         KeyframeSettings(zoom=30)
