@@ -1,11 +1,15 @@
 """The backbone and its weight files."""
 
+import subprocess
+import sys
+
 import pytest
 import torch
 from torch import nn
+from torch.nn import functional
 
 from ugr_lightning.errors import CheckpointError, ConfigError
-from ugr_lightning.models.vision import ResNet18, convolve, spatial_softmax
+from ugr_lightning.models.vision import BasicBlock, ResNet18, convolve, spatial_softmax
 
 
 def torchvision_like(width: int = 8) -> dict[str, torch.Tensor]:
@@ -128,9 +132,32 @@ def test_other_width_is_refused_and_changes_nothing(tmp_path):
     assert not network.pretrained
 
 
-def test_a_width_that_crashes_kernels_is_refused():
+def test_a_width_that_cannot_be_divided_is_refused():
     with pytest.raises(ConfigError, match="multiple of 8"):
         ResNet18(4)
+
+
+def test_a_narrow_backbone_learns_from_large_pictures():
+    program = """
+import torch
+from ugr_lightning.models.vision import ResNet18
+network = ResNet18(8, norm="batch")
+for _ in range(3):
+    pictures = torch.randint(0, 256, (6, 3, 240, 320), dtype=torch.uint8)
+    network(network.prepare(pictures))[-1].square().mean().backward()
+assert all(p.grad.isfinite().all() for p in network.parameters())
+"""  # in a process of its own, which the kernel that this is about ends
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_a_narrow_shortcut_leaves_out_what_a_strided_one_does():
+    block = BasicBlock(8, 16, 2, "batch").eval()
+    x = torch.randn(2, 8, 9, 12)
+    shortcut, norm = block.downsample
+    expected = norm(functional.conv2d(x, shortcut.weight, stride=2))  # (2, 16, 5, 6)
+    block.bn2.weight.data.zero_()
+    assert torch.allclose(block(x), expected.relu(), atol=1e-6)
 
 
 def test_spatial_softmax_finds_a_peak():

@@ -120,9 +120,10 @@ def test_the_correction_moves_what_the_maps_found_and_its_axes_are_told():
     assert torch.equal(told[..., -6:], answers[1, 3:].expand(2, 2, -1))
 
 
-def test_a_crop_is_cut_into_eighths():
-    with pytest.raises(ConfigError, match="multiple of 8"):
-        KeyframeSettings(zoom=30)
+@pytest.mark.parametrize("side", [30, -8, 1000])
+def test_a_crop_is_cut_into_eighths_and_smaller_than_a_picture(side):
+    with pytest.raises(ConfigError, match="multiple of 8 pixels, at most 128"):
+        KeyframeSettings(zoom=side)
 
 
 @pytest.mark.parametrize("displaced", [0.0, -0.015, float("nan"), float("inf")])

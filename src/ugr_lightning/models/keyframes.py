@@ -54,8 +54,8 @@ class KeyframeSettings:
     displaced: float = 0.015
 
     def __post_init__(self) -> None:
-        if self.zoom < 0 or self.zoom % 8:
-            raise ConfigError("keyframes.zoom", "0 or a multiple of 8 pixels", self.zoom, "Use 0, or 32.")
+        if self.zoom not in range(0, 129, 8):
+            raise ConfigError("keyframes.zoom", "0 or a multiple of 8 pixels, at most 128", self.zoom, "Use 0, or 32.")
         if not 0 < self.displaced < math.inf:
             raise ConfigError("keyframes.displaced", "a distance above 0, m", self.displaced, "Use 0.015.")
 
@@ -145,7 +145,7 @@ class KeyframeFinder(nn.Module):
             place, mass, window = peak(maps)  # (B V, 4, ...)
             terms: dict[str, Tensor] = {}
             if labels is not None:
-                terms = self._terms(chances, place, shift, projection, labels, (height, width))
+                terms = self._terms(chances, place, shift, projection, labels, (height, width), pictures.shape[3:])
             points, doubts = self._points(place, mass, shift, projection)  # (B, 2, 3) each
             if self.zoom is None:
                 axes = self._axes(features.float(), window, cameras)  # (B, 2, 6)
@@ -265,19 +265,20 @@ class KeyframeFinder(nn.Module):
         shift: Tensor,
         projection: Tensor,
         labels: Keyframes,
-        size: tuple[int, int],
+        cells: tuple[int, int],
+        pixels: torch.Size,
     ) -> dict[str, Tensor]:
         """The cross-entropy against the true cells, and for the log the error in pixels of the first camera."""
         target, inside = project(self._with_feet(labels.position), projection)  # (B, V, 2, 2, 2), (B, V, 2, 2)
         target = target.flatten(0, 1).flatten(1, 2) - shift[:, None]  # (B V, 4, 2), in the moved picture
         inside = inside.flatten(0, 1).flatten(1, 2) & (target.abs().amax(-1) < 1)  # (B V, 4)
-        told = cross_entropy(chances, target, inside, size)  # (B V, 4)
-        scale = target.new_tensor([size[1], size[0]]) * 2  # pixels of a picture four times as fine
+        told = cross_entropy(chances, target, inside, cells)  # (B V, 4)
+        scale = target.new_tensor([pixels[1], pixels[0]]) / 2
         error = ((place - target) * scale).norm(dim=-1).detach()  # (B V, 4)
         first = torch.zeros_like(inside)
         first[:: projection.shape[1]] = True
-        pixels = error.where(inside & first, torch.nan).nanmedian().nan_to_num()
-        return {"keyframe": told.mean(), "keyframe_px": pixels}
+        median = error.where(inside & first, torch.nan).nanmedian().nan_to_num()
+        return {"keyframe": told.mean(), "keyframe_px": median}
 
 
 def project(points: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:

@@ -15,6 +15,8 @@ StemName = Literal["standard", "unshuffle"]
 IMAGENET_MEAN = (0.485, 0.456, 0.406)
 IMAGENET_STD = (0.229, 0.224, 0.225)
 Fold = Literal[4, 8]
+NARROW = 16
+"""With fewer inputs, oneDNN's strided 1x1 convolution corrupts memory in training (torch 2.13, AVX2 and AVX-512)."""
 _PREFIXES = ("", "backbones.0.0.body.", "model.backbones.0.0.body.", "backbone.", "model.backbone.", "policy.backbone.")
 
 
@@ -83,8 +85,9 @@ class BasicBlock(nn.Module):
         self.conv2 = nn.Conv2d(outputs, outputs, 3, 1, 1, bias=False)
         self.bn2 = make_norm(norm, outputs)
         self.downsample: nn.Sequential | None = None
+        self.leave_out = stride if inputs < NARROW else 1
         if stride != 1 or inputs != outputs:
-            shortcut = nn.Conv2d(inputs, outputs, 1, stride, bias=False)
+            shortcut = nn.Conv2d(inputs, outputs, 1, stride // self.leave_out, bias=False)
             self.downsample = nn.Sequential(shortcut, make_norm(norm, outputs))
 
     def forward(self, x: Tensor) -> Tensor:
@@ -94,7 +97,7 @@ class BasicBlock(nn.Module):
         if self.downsample is not None:
             conv, norm = self.downsample
             assert isinstance(conv, nn.Conv2d)
-            x = convolve(x, conv, norm)
+            x = convolve(x[:, :, :: self.leave_out, :: self.leave_out], conv, norm)
         return functional.relu(y.add_(x), inplace=True)  # no layer needs its own output to go back
 
 
@@ -131,7 +134,7 @@ class ResNet18(nn.Module):
         super().__init__()
         if stride not in (16, 32):
             raise ConfigError("backbone_stride", "16 or 32", stride, "Choose one of the two.")
-        if width < 8 or width % 8:  # with fewer, oneDNN's strided 1x1 convolution corrupts memory on AVX2 (torch 2.13)
+        if width < 8 or width % 8:
             raise ConfigError("backbone_width", "a multiple of 8", width, "Use 8, 16, 32 or 64.")
         self.stem, self.norm, self.fold = stem, norm, fold
         if stem == "standard":
