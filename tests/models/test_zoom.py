@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from torch.nn import functional
 
 from ugr_lightning.contract import CAMERAS, Keyframes
 from ugr_lightning.errors import ConfigError
@@ -43,6 +44,14 @@ def test_a_crop_shows_the_pixels_around_a_point_and_repeats_the_border():
     assert inside.tolist() == [[[True, True, False]]]  # the third is behind the camera
 
 
+def test_a_crop_of_the_next_level_shows_twice_as_much_around_the_same_place():
+    pictures = torch.randint(0, 256, (1, 1, 3, HEIGHT, WIDTH), dtype=torch.uint8)
+    middle = torch.zeros(1, 1, 3)  # between four pixels of either level
+    fine, _ = crop(pictures, ABOVE[None, None], middle, 16)
+    coarse, _ = crop(pictures, ABOVE[None, None], middle, 8, level=1)
+    assert torch.allclose(coarse[0, 0, 0], functional.avg_pool2d(fine[0, 0, 0], 2), atol=1e-5)
+
+
 def test_crops_of_a_mirror_image_are_the_mirror_images_of_the_crops(batch):
     _, points = table(3)
     views = torch.stack([ABOVE, SIDEWAYS, ABOVE + 0.1 * SIDEWAYS]).expand(3, -1, -1, -1)
@@ -59,9 +68,10 @@ def test_crops_of_a_mirror_image_are_the_mirror_images_of_the_crops(batch):
     assert torch.allclose(after[::2][still[::2]], expected[still[::2]], atol=1e-4)
 
 
-def test_it_learns_to_say_from_the_pictures_how_far_off_a_point_is():
+@pytest.mark.parametrize("levels", [1, 2])
+def test_it_learns_to_say_from_the_pictures_how_far_off_a_point_is(levels):
     torch.manual_seed(0)
-    zoom = Zoom(16, 2, 6, channels=8)
+    zoom = Zoom(16, 2, 6, levels, channels=8)
     optimiser = torch.optim.Adam(zoom.parameters(), 3e-3)
     for _ in range(150):
         projection, points = table(32)
@@ -124,6 +134,11 @@ def test_the_correction_moves_what_the_maps_found_and_its_axes_are_told():
 def test_a_crop_is_cut_into_eighths_and_smaller_than_a_picture(side):
     with pytest.raises(ConfigError, match="multiple of 8 pixels, at most 128"):
         KeyframeSettings(zoom=side)
+
+
+def test_levels_are_few():
+    with pytest.raises(ConfigError, match=r"keyframes\.zoom_levels: expected 1 to 4"):
+        KeyframeSettings(zoom=8, zoom_levels=0)
 
 
 @pytest.mark.parametrize("displaced", [0.0, -0.015, float("nan"), float("inf")])

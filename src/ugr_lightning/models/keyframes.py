@@ -41,6 +41,7 @@ class KeyframeSettings:
         context: dilations of further convolutions of the maps' features, which see farther around.
         grips: tell the maps how open the grippers are: whether one has let go already, a picture hardly shows.
         zoom: pixels on a side of the crops in which a second look corrects what the maps find; 0 for none.
+        zoom_levels: crops of each place, each of twice the field of view of the one before.
         displaced: standard deviation, m, of what the second look learns to correct.
     """
 
@@ -51,11 +52,14 @@ class KeyframeSettings:
     context: tuple[int, ...] = ()
     grips: bool = False
     zoom: int = 0
+    zoom_levels: int = 1
     displaced: float = 0.015
 
     def __post_init__(self) -> None:
         if self.zoom not in range(0, 129, 8):
             raise ConfigError("keyframes.zoom", "0 or a multiple of 8 pixels, at most 128", self.zoom, "Use 0, or 32.")
+        if self.zoom_levels not in range(1, 5):
+            raise ConfigError("keyframes.zoom_levels", "1 to 4", self.zoom_levels, "Use 1, or 2 for larger pictures.")
         if not 0 < self.displaced < math.inf:
             raise ConfigError("keyframes.displaced", "a distance above 0, m", self.displaced, "Use 0.015.")
 
@@ -99,7 +103,7 @@ class KeyframeFinder(nn.Module):
         self.grips = nn.Linear(ARMS, channels) if settings.grips else None
         self.maps = nn.Conv2d(channels, maps, 1)
         self.absent = nn.Linear(2 * channels, maps)
-        self.zoom = Zoom(settings.zoom, cameras, AXES) if settings.zoom else None
+        self.zoom = Zoom(settings.zoom, cameras, AXES, settings.zoom_levels) if settings.zoom else None
         self.axes = nn.Linear(POINTS * channels, AXES) if self.zoom is None else None
         self.register_buffer("centre", torch.zeros(ARMS, 3))
         self.register_buffer("spread", torch.ones(ARMS, 3))

@@ -40,14 +40,15 @@ class Zoom(nn.Module):
         side: S, pixels of a crop, a multiple of 8.
         cameras: V.
         axes: numbers that tell an orientation.
+        levels: L, crops of each place; each shows twice as much as the one before it, half as fine.
         channels: of the first of four layers.
 
     Source: RVT-2 (arXiv:2406.08545) looks a second time where a coarse stage points; docs/recipe.md (the second look).
     """
 
-    def __init__(self, side: int, cameras: int, axes: int, channels: int = 24) -> None:
+    def __init__(self, side: int, cameras: int, axes: int, levels: int = 1, channels: int = 24) -> None:
         super().__init__()
-        self.side, wide, told = side, 2 * channels, 64
+        self.side, self.levels, wide, told = side, levels, 2 * channels, 64
         self.eyes = nn.ModuleList(
             nn.Sequential(
                 *_layer(3, channels, 1),
@@ -57,9 +58,9 @@ class Zoom(nn.Module):
                 nn.Flatten(),
                 nn.Linear(wide * (side // 8) ** 2, told),
             )
-            for _ in range(cameras)
+            for _ in range(levels * cameras)
         )
-        known = (told + 1) * cameras + 3 + 2  # what each camera sees and whether; where; both grippers
+        known = (told * levels + 1) * cameras + 3 + 2  # what each camera sees and whether; where; both grippers
         self.hands = nn.ModuleList(
             nn.Sequential(nn.Linear(known, 2 * told), nn.ReLU(), nn.Linear(2 * told, 3 + axes)) for _ in range(2)
         )
@@ -77,10 +78,11 @@ class Zoom(nn.Module):
             grips: (B, 2) how open the grippers are, normalised.
             jitter: largest random relative change of contrast and brightness.
         """
-        crops, inside = crop(pictures, projection, points, self.side)  # (B, V, 2, 3, S, S), (B, V, 2)
+        shown = [crop(pictures, projection, points, self.side, level) for level in range(self.levels)]
+        crops, inside = torch.cat([squares for squares, _ in shown], 1), shown[0][1]  # (B, L V, 2, 3, S, S), (B, V, 2)
         if jitter:
             crops = jitter_colour(crops.flatten(0, 2), jitter, crops.shape[1] * crops.shape[2]).view_as(crops)
-        crops = crops * inside[..., None, None, None]
+        crops = crops * inside.repeat(1, self.levels, 1)[..., None, None, None]
         seen = [eye(crops[:, camera].flatten(0, 1)).unflatten(0, (-1, 2)) for camera, eye in enumerate(self.eyes)]
         told = [*seen, inside.transpose(1, 2).to(where.dtype), where, grips[:, None].expand(-1, 2, -1)]
         known = torch.cat(told, dim=-1)  # (B, 2, known)
@@ -89,7 +91,7 @@ class Zoom(nn.Module):
         return Closer(correction if self.training else correction.clamp(-FARTHEST, FARTHEST), axes)
 
 
-def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int) -> tuple[Tensor, Tensor]:
+def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int, level: int = 0) -> tuple[Tensor, Tensor]:
     """Squares of pixels around points of the world, in every picture.
 
     Args:
@@ -97,11 +99,15 @@ def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int) -> tup
         projection: (B, V, 3, 4).
         points: (B, n, 3) m.
         side: S.
+        level: pictures are halved so often before.
 
     Returns:
         (B, V, n, 3, S, S) float32, -1 to 1, borders repeated; (B, V, n) whether a point is in or near the picture.
     """
-    count, (height, width) = points.shape[1], pictures.shape[3:]
+    pixels = pictures.flatten(0, 1).float() / 127.5 - 1  # (B V, 3, H, W)
+    if level:
+        pixels = functional.avg_pool2d(pixels, 1 << level)
+    count, (height, width) = points.shape[1], pixels.shape[2:]
     matrix, offset = projection[:, :, None, :, :3], projection[:, :, None, :, 3]
     seen = (matrix @ points[:, None, ..., None]).squeeze(-1) + offset  # (B, V, n, 3)
     depth = seen[..., 2]
@@ -111,7 +117,6 @@ def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int) -> tup
     u = (middle[..., :1] + 2 / width * steps)[..., None, :].expand(*middle.shape[:3], side, side)
     v = (middle[..., 1:] + 2 / height * steps)[..., None].expand(*middle.shape[:3], side, side)
     grid = torch.stack([u, v], dim=-1).flatten(0, 1).flatten(1, 2)  # (B V, n S, S, 2)
-    pixels = pictures.flatten(0, 1).float() / 127.5 - 1  # (B V, 3, H, W)
     squares = functional.grid_sample(pixels, grid, padding_mode="border", align_corners=False)  # (B V, 3, n S, S)
     squares = squares.unflatten(2, (count, side)).unflatten(0, (-1, pictures.shape[1]))  # (B, V, 3, n, S, S)
     return squares.transpose(2, 3), inside
