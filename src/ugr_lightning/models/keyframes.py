@@ -5,6 +5,7 @@ free: the calibration of the cameras projects the tool's pose at its next keyfra
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -140,31 +141,22 @@ class KeyframeFinder(nn.Module):
             labels: what is to be found, in training and validation.
             jitter: largest random relative change of a crop's contrast and brightness.
         """
-        cameras = projection.shape[1]
-        features = self._features(stages, cameras, grips)  # (B V, C, h, w)
+        features = self._features(stages, projection.shape[1], grips)  # (B V, C, h, w)
         chances = self._chances(features)  # (B V, 4, h w + 1) float32, logarithms
         with full_precision(features.device):  # millimetres need all digits
-            cameras, (height, width) = projection.shape[1], features.shape[2:]
-            maps = chances[..., :-1].exp().unflatten(2, (height, width))  # (B V, 4, h, w)
+            cameras, cells = projection.shape[1], features.shape[2:]
+            maps = chances[..., :-1].exp().unflatten(2, cells)  # (B V, 4, h, w)
             place, mass, window = peak(maps)  # (B V, 4, ...)
-            terms: dict[str, Tensor] = {}
-            if labels is not None:
-                terms = self._terms(chances, place, shift, projection, labels, (height, width), pictures.shape[3:])
             points, doubts = self._points(place, mass, shift, projection)  # (B, 2, 3) each
             if self.zoom is None:
-                axes = self._axes(features.float(), window, cameras)  # (B, 2, 6)
+                axes, miss = self._axes(features.float(), window, cameras), points.new_zeros(())  # (B, 2, 6), ()
             else:
-                if self.training and labels is not None:  # what the maps find on training scenes is too good
-                    points = labels.position + self.settings.displaced * torch.randn_like(points)
-                closer = self.zoom(pictures, projection, points, self._normalised(points), grips, jitter)
-                if labels is not None:
-                    wanted = (labels.position - points) / self.settings.displaced  # (B, 2, 3)
-                    miss = functional.smooth_l1_loss(closer.correction, wanted, beta=0.25)
-                    terms["keyframe"] = terms["keyframe"] + miss
-                points = points + self.settings.displaced * closer.correction.detach()
-                axes = closer.axes
+                points, axes, miss = self._look_again(pictures, projection, points, grips, labels, jitter)
+            terms: dict[str, Tensor] = {}
             if labels is not None:
-                terms["keyframe"] = terms["keyframe"] + 3 * (axes - labels.axes).abs().mean()
+                told, pixels = self._map_terms(chances, place, shift, projection, labels, cells, pictures.shape[3:])
+                terms["keyframe"] = told + miss + 3 * (axes - labels.axes).abs().mean()
+                terms["keyframe_px"] = pixels
                 terms["keyframe_mm"] = 1000 * (points - labels.position).norm(dim=-1).median()
             axes = axes.detach()
             if self.training and self.settings.noise:
@@ -184,6 +176,26 @@ class KeyframeFinder(nn.Module):
         sure = mass.view(shape).mean((1, 3))  # (B, 2)
         doubts = torch.stack([(misses / AGREES).clamp(max=3), support.clamp(min=1e-6).log() / 3, sure], -1)  # (B, 2, 3)
         return points, doubts
+
+    def _look_again(
+        self,
+        pictures: Tensor,
+        projection: Tensor,
+        points: Tensor,
+        grips: Tensor,
+        labels: Keyframes | None,
+        jitter: float,
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """Points (B, 2, 3) corrected, without gradient; orientations (B, 2, 6); the loss of the second look, ()."""
+        assert self.zoom is not None
+        if self.training and labels is not None:  # what the maps find on training scenes is too good
+            points = labels.position + self.settings.displaced * torch.randn_like(points)
+        closer = self.zoom(pictures, projection, points, self._normalised(points), grips, jitter)
+        miss = points.new_zeros(())
+        if labels is not None:
+            wanted = (labels.position - points) / self.settings.displaced  # (B, 2, 3)
+            miss = functional.smooth_l1_loss(closer.correction, wanted, beta=0.25)
+        return points + self.settings.displaced * closer.correction.detach(), closer.axes, miss
 
     def _axes(self, features: Tensor, window: Tensor, cameras: int) -> Tensor:
         """Orientations (B, 2, 6), read where the first camera's maps are high."""
@@ -262,17 +274,17 @@ class KeyframeFinder(nn.Module):
         absent = self.absent(pooled).float()[..., None] + SHY  # (B V, 4, 1)
         return torch.cat([self.maps(features).float().flatten(2), absent], dim=-1).log_softmax(-1)
 
-    def _terms(
+    def _map_terms(
         self,
         chances: Tensor,
         place: Tensor,
         shift: Tensor,
         projection: Tensor,
         labels: Keyframes,
-        cells: tuple[int, int],
+        cells: torch.Size,
         pixels: torch.Size,
-    ) -> dict[str, Tensor]:
-        """The cross-entropy against the true cells, and for the log the error in pixels of the first camera."""
+    ) -> tuple[Tensor, Tensor]:
+        """The maps' cross-entropy against the true cells, and for the log their error in pixels of the first camera."""
         target, inside = project(self._with_feet(labels.position), projection)  # (B, V, 2, 2, 2), (B, V, 2, 2)
         target = target.flatten(0, 1).flatten(1, 2) - shift[:, None]  # (B V, 4, 2), in the moved picture
         inside = inside.flatten(0, 1).flatten(1, 2) & (target.abs().amax(-1) < 1)  # (B V, 4)
@@ -282,7 +294,7 @@ class KeyframeFinder(nn.Module):
         first = torch.zeros_like(inside)
         first[:: projection.shape[1]] = True
         median = error.where(inside & first, torch.nan).nanmedian().nan_to_num()
-        return {"keyframe": told.mean(), "keyframe_px": median}
+        return told.mean(), median
 
 
 def project(points: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:
@@ -302,7 +314,7 @@ def project(points: Tensor, projection: Tensor) -> tuple[Tensor, Tensor]:
     return place, (depth > NEAR) & (place.abs().amax(-1) < 1)
 
 
-def cross_entropy(chances: Tensor, target: Tensor, inside: Tensor, size: tuple[int, int]) -> Tensor:
+def cross_entropy(chances: Tensor, target: Tensor, inside: Tensor, size: Sequence[int]) -> Tensor:
     """Negative log-likelihood of the cells around each target, by how near they are; of absence where it is outside.
 
     Args:
