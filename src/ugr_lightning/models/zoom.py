@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn import functional
 
 from ugr_lightning.models.augmentation import jitter_colour
 
@@ -104,22 +103,29 @@ def crop(pictures: Tensor, projection: Tensor, points: Tensor, side: int, level:
     Returns:
         (B, V, n, 3, S, S) float32, -1 to 1, borders repeated; (B, V, n) whether a point is in or near the picture.
     """
-    pixels = pictures.flatten(0, 1).float() / 127.5 - 1  # (B V, 3, H, W)
-    if level:
-        pixels = functional.avg_pool2d(pixels, 1 << level)
-    count, (height, width) = points.shape[1], pixels.shape[2:]
+    size = points.new_tensor([pictures.shape[4] >> level, pictures.shape[3] >> level])
     matrix, offset = projection[:, :, None, :, :3], projection[:, :, None, :, 3]
     seen = (matrix @ points[:, None, ..., None]).squeeze(-1) + offset  # (B, V, n, 3)
     depth = seen[..., 2]
     middle = seen[..., :2] / depth.clamp(min=NEAR)[..., None]  # (B, V, n, 2) u, v in image units
     inside = (depth > NEAR) & (middle.abs().amax(-1) < EDGE)
-    steps = torch.arange(side, device=points.device) + 0.5 - side / 2  # (S,) pixels
-    u = (middle[..., :1] + 2 / width * steps)[..., None, :].expand(*middle.shape[:3], side, side)
-    v = (middle[..., 1:] + 2 / height * steps)[..., None].expand(*middle.shape[:3], side, side)
-    grid = torch.stack([u, v], dim=-1).flatten(0, 1).flatten(1, 2)  # (B V, n S, S, 2)
-    squares = functional.grid_sample(pixels, grid, padding_mode="border", align_corners=False)  # (B V, 3, n S, S)
-    squares = squares.unflatten(2, (count, side)).unflatten(0, (-1, pictures.shape[1]))  # (B, V, 3, n, S, S)
-    return squares.transpose(2, 3), inside
+    first = (middle + 1) / 2 * size - side / 2  # (B, V, n, 2) pixels
+    whole = first.floor()
+    within = torch.arange(side + 1, device=points.device)  # a crop lies between pixels
+    places = (whole.long()[..., None] + within).clamp(min=0).minimum(size.long()[:, None] - 1)  # (B, V, n, 2, S + 1)
+    if level:
+        finer = torch.arange(1 << level, device=points.device)
+        places = ((places << level)[..., None] + finer).flatten(-2)  # (B, V, n, 2, 2^level (S + 1))
+    batch, camera = (torch.arange(length, device=points.device) for length in pictures.shape[:2])
+    columns, rows = places[..., 0, None, :], places[..., 1, :, None]
+    pixels = pictures.movedim(2, -1)[batch[:, None, None, None, None], camera[:, None, None, None], rows, columns]
+    squares = pixels.float() / 127.5 - 1  # (B, V, n, S + 1, S + 1, 3)
+    if level:
+        squares = squares.unflatten(4, (side + 1, -1)).mean(5).unflatten(3, (side + 1, -1)).mean(4)
+    right, down = (first - whole)[..., None, None, None].unbind(3)  # (B, V, n, 1, 1, 1) shares of the next pixel
+    squares = squares[..., :-1, :, :].lerp(squares[..., 1:, :, :], down)
+    squares = squares[..., :-1, :].lerp(squares[..., 1:, :], right)  # (B, V, n, S, S, 3)
+    return squares.movedim(-1, 3), inside
 
 
 def _layer(inputs: int, outputs: int, stride: int) -> tuple[nn.Module, ...]:
