@@ -81,7 +81,7 @@ def test_keyframes_are_exported_with_the_calibration_as_an_input(tmp_path, monke
     monkeypatch.chdir(tmp_path)
     torch.manual_seed(0)
     sizes = {"backbone_stem": "unshuffle", "backbone_width": 8, "backbone_norm": "batch", "chunk_length": 10}
-    looks = {"keyframes": KeyframeSettings(channels=8, zoom=8), "refine": Full()}
+    looks = {"keyframes": KeyframeSettings(channels=8, zoom=8, zoom_levels=2), "refine": Full()}
     policy = ACT(**TINY, **sizes, **looks, decoder_layers=1)
     save(policy)
     assert main(["export", "policy.ckpt", "--to", to, "--out", "folder"]) == 0

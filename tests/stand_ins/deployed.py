@@ -49,7 +49,7 @@ def tiny_act(fitted: bool = True, **changes) -> ACT:
 
 def looking_act(**changes) -> ACT:
     """One that is told where keyframes are, and so needs the calibration of the cameras."""
-    return tiny_act(keyframes=KeyframeSettings(channels=8, zoom=8), keypoints=1, **changes)
+    return tiny_act(keyframes=KeyframeSettings(channels=8, zoom=8, zoom_levels=2), keypoints=1, **changes)
 
 
 def save(policy: ChunkPolicy, path, **data):
