@@ -12,7 +12,7 @@ SETTINGS = ("demo_clean", "demo_randomized")
 
 
 def gallery(folder, tasks, **more):
-    given = {"image_size": (24, 32), "workers": 1, "progress": False} | more
+    given = {"image_size": (24, 32), "workers": 1} | more
     return make_gallery(folder, tasks, SETTINGS, **given)
 
 

@@ -31,7 +31,7 @@ def episodes(recorded, tmp_path):
 
 
 def again(paths, **more):
-    return replay(paths, workers=1, progress=False, **more)
+    return replay(paths, workers=1, **more)
 
 
 def alone(path):

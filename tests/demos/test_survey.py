@@ -15,7 +15,7 @@ from ugr_lightning.sim.registry import open_simulator
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
 
-QUICK = {"workers": 1, "progress": False}
+QUICK = {"workers": 1}
 SMALL = QUICK | {"image_sizes": ((12, 16), (24, 32)), "episodes": 10, "dummy_episodes": 2, "recordings": 2}
 
 
@@ -150,4 +150,4 @@ def test_an_expert_that_fails_leaves_the_list_as_it_was(its_seeds):
 def test_a_seed_list_of_another_version_is_refused_before_anything_runs(monkeypatch):
     monkeypatch.setattr(seeds, "task_version", lambda task: 99)
     with pytest.raises(SimulationError, match="got a seed list of click_alarmclock, version"):
-        verify_evaluation_seeds("click_alarmclock", progress=False)
+        verify_evaluation_seeds("click_alarmclock")

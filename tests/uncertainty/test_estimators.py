@@ -6,12 +6,7 @@ import torch
 
 from ugr_lightning.contract import Chunk
 from ugr_lightning.models.transformer import Dropout
-from ugr_lightning.uncertainty.estimators import (
-    disagreement,
-    dropout_on,
-    estimator_table,
-    sampled_deviation,
-)
+from ugr_lightning.uncertainty.estimators import disagreement, dropout_on, estimator_table, sampled_deviation
 from ugr_lightning.uncertainty.predictions import Predictions
 
 K, A = 6, 3
@@ -41,17 +36,19 @@ def test_disagreement_is_the_distance_to_what_earlier_chunks_said_of_the_same_mo
 
 def test_sampled_deviation_recovers_the_scatter_of_the_predictions_in_units_of_the_data():
     std = torch.tensor([0.5, 1.0, 2.0])
-    frames = SimpleNamespace(of=lambda episodes, stride: np.arange(20))
+    frames = SimpleNamespace(of=lambda episodes, stride: np.arange(16))
     part = SimpleNamespace(observation="seen")
     data = SimpleNamespace(
         data=SimpleNamespace(frames=frames, __getitems__=lambda rows: part), statistics=SimpleNamespace(action_std=std)
     )
     size = torch.linspace(0.1, 1, K)[:, None]
     torch.manual_seed(0)
-    found = sampled_deviation(
-        lambda seen: Chunk(torch.randn(20, K, A) * size * std), data, (0,), stride=1, samples=400, batch_size=20
-    )
-    assert found.shape == (20, K)
+
+    def draw(seen):
+        return Chunk(torch.randn(16, K, A) * size * std)
+
+    found = sampled_deviation(draw, data, (0,), stride=1, samples=400)
+    assert found.shape == (16, K)
     assert np.allclose(found, np.sqrt(A) * size[:, 0].numpy(), rtol=0.15)
 
 

@@ -45,6 +45,7 @@ ORIGINAL = Dialect(
     first_layer_only=True,
 )
 DEAD = ("is_pad_head.",)
+LAYERS = 7  # of its decoder
 EXTRA = "original_act"
 """Entry of a checkpoint that keeps what our policy has no place for, so that it can go back."""
 
@@ -129,19 +130,13 @@ def set_normalisation(
 
 
 def export_act(
-    policy: ACT,
-    extra: Mapping[str, Any] | None = None,
-    *,
-    decoder_layers: int = 7,
-    drop_refinement: bool = False,
+    policy: ACT, extra: Mapping[str, Any] | None = None, *, drop_refinement: bool = False
 ) -> OriginalCheckpoint:
-    """Write a policy of ours as the original code would.
+    """Write a policy of ours as the original code would; decoder layers it never reads are copies of the first.
 
     Args:
         policy: plain ACT at the published structure.
-        extra: what an import has kept under `EXTRA`; it returns unchanged.
-        decoder_layers: layers that the original builds; those it never reads are copies of the first where `extra`
-            has none.
+        extra: what an import has kept under `EXTRA`; it returns unchanged, in place of copies.
         drop_refinement: leave a refinement branch and an uncertainty head behind.
 
     Raises:
@@ -163,8 +158,8 @@ def export_act(
     if extra is not None:
         weights |= {ORIGINAL.prefix + name: value for name, value in extra["unused"].items()}
     else:
-        weights |= _unread(weights, policy, decoder_layers)
-        notes.append(f"decoder layers 2 to {decoder_layers}, which it never reads, are copies of the first")
+        weights |= _unread(weights, policy)
+        notes.append(f"decoder layers 2 to {LAYERS}, which it never reads, are copies of the first")
         notes.append("is_pad_head, which it never reads, is zero")
     own = policy.normalizer
     example = None if extra is None else extra["example_qpos"]
@@ -175,13 +170,13 @@ def export_act(
     return OriginalCheckpoint(weights, ActStatistics(*(value.detach().cpu().clone() for value in numbers)), notes)
 
 
-def _unread(weights: Mapping[str, Tensor], policy: ACT, decoder_layers: int) -> dict[str, Tensor]:
+def _unread(weights: Mapping[str, Tensor], policy: ACT) -> dict[str, Tensor]:
     """Tensors that the original code builds and never reads."""
     first = f"{ORIGINAL.prefix}transformer.decoder.layers.0."
     layer = {name.removeprefix(first): value for name, value in weights.items() if name.startswith(first)}
     copies = {
         f"{ORIGINAL.prefix}transformer.decoder.layers.{index}.{name}": value.clone()
-        for index in range(1, decoder_layers)
+        for index in range(1, LAYERS)
         for name, value in layer.items()
     }
     dim = policy.query_embed.shape[1]

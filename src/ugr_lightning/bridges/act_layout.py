@@ -153,14 +153,13 @@ def sizes_of(weights: Mapping[str, Tensor], dialect: Dialect, where: object) -> 
         return tuple(weights[name].shape)
 
     chunk_length, dim = shape("query_embed", 2)
-    cvae_layers = _layers(weights, "posterior.layers.")
     return {
         "dim": dim,
         "chunk_length": chunk_length,
         "feedforward": shape("encoder.0.linear1.weight", 2)[0],
         "encoder_layers": _layers(weights, "encoder."),
         "decoder_layers": max(_layers(weights, "decoder."), 1),
-        "cvae_layers": cvae_layers,
+        "cvae_layers": _layers(weights, "posterior.layers."),
         "latent_dim": shape("latent_out_proj.weight", 2)[1],
         "state_dim": shape("state_proj.weight", 2)[1],
         "action_dim": shape("action_head.weight", 2)[0],

@@ -80,15 +80,10 @@ def write_adapter_folder(
     settings = {"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": dict(cameras or {})}
     used = load(settings).deployment.cameras
     named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in used.items())
-    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
-    return _place_checkpoint(template, checkpoint, out, values, copy)
-
-
-def _place_checkpoint(template: str, checkpoint: Path, out: Path, values: Mapping[str, str], copy: bool) -> list[Path]:
-    """Write a folder that knows where its checkpoint is: `@CHECKPOINT@` in the template."""
     place = out / (checkpoint.name if checkpoint.is_dir() else "policy_best.ckpt") if copy else checkpoint.resolve()
-    named = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
-    written = _write_folder(template, out, {**values, "CHECKPOINT": named})
+    values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
+    values["CHECKPOINT"] = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
+    written = _write_folder(template, out, values)
     if not copy:
         return written
     if checkpoint.is_dir():

@@ -14,9 +14,9 @@ def model_card(
     *,
     name: str,
     use: str,
-    results: Sequence[EpisodeResult] = (),
-    licence: str = "apache-2.0",
-    notes: Sequence[str] = (),
+    results: Sequence[EpisodeResult],
+    licence: str,
+    notes: Sequence[str],
 ) -> str:
     """Write the card, as Markdown with the front matter that model hubs read.
 

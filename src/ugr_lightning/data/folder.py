@@ -98,11 +98,10 @@ def read_scene_info(folder: Path) -> dict[int, dict[str, Any]]:
         raise DataError(path, "JSON by `episode_<index>`", str(error), "Restore or remove the file.") from error
 
 
-def write_instructions(folder: Path, index: int, seen: Sequence[str], unseen: Sequence[str] = ()) -> None:
+def write_instructions(folder: Path, index: int, seen: Sequence[str]) -> None:
     """Write `instructions/episode<index>.json`: what the robot is told to do, in words."""
-    content = {"seen": list(seen), "unseen": list(unseen)}
     path = Path(folder) / "instructions" / f"episode{index}.json"
-    _publish_json(path, content)
+    _publish_json(path, {"seen": list(seen), "unseen": []})
 
 
 def _publish_json(path: Path, content: object) -> None:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from PIL import Image
 
-from ugr_lightning.data.storage.jpeg import decode_jpeg, encode_frame
+from ugr_lightning.data.storage.jpeg import decode_picture, encode_frame
 from ugr_lightning.demos.survey import FIRST_SEED
 from ugr_lightning.embodiment import CAMERAS
 from ugr_lightning.errors import SimulationError
@@ -82,7 +82,7 @@ class Photographer:
 
     def _write_gif(self, path: Path, frames: list[tuple[tuple[bytes, ...], bool]], control_hz: float) -> None:
         """As many frames as fit into the size allowed."""
-        pictures = [_small(self._unpacked(jpegs)) for jpegs, _ in frames]
+        pictures = [_small(jpegs) for jpegs, _ in frames]
         for count in FRAME_COUNTS:
             every = max(1, -(-len(frames) // count))
             film = compose_frames(pictures, success=[success for _, success in frames], every=every)
@@ -93,25 +93,19 @@ class Photographer:
     def _write_stills(self, path: Path, frames: list[tuple[tuple[bytes, ...], bool]]) -> None:
         """Start, middle and end from top to bottom, the cameras from left to right."""
         moments = (0, len(frames) // 2, len(frames) - 1)
-        rows = [np.concatenate(list(self._unpacked(frames[step][0])), axis=1) for step in moments]  # (H, V W, 3)
+        rows = [np.concatenate([decode_picture(jpeg) for jpeg in frames[step][0]], axis=1) for step in moments]
         stills = Image.fromarray(np.concatenate(rows))
         publish(path, lambda partial: stills.save(partial, format="JPEG", quality=80))
-
-    def _unpacked(self, jpegs: tuple[bytes, ...]) -> np.ndarray:
-        """(V, H, W, 3) uint8."""
-        images = np.empty((len(jpegs), *self._image_size, 3), np.uint8)
-        for image, jpeg in zip(images, jpegs, strict=True):
-            decode_jpeg(jpeg, image)
-        return images
 
 
 def _packed(frame: Frame) -> tuple[tuple[bytes, ...], bool]:
     return encode_frame(frame.images), bool(frame.success)
 
 
-def _small(images: np.ndarray) -> np.ndarray:
+def _small(jpegs: tuple[bytes, ...]) -> np.ndarray:
     """(V, h, w, 3) uint8 at the size of the GIF."""
-    return np.stack([np.asarray(Image.fromarray(image).resize(GIF_SIZE, Image.Resampling.BOX)) for image in images])
+    images = [Image.fromarray(decode_picture(jpeg)).resize(GIF_SIZE, Image.Resampling.BOX) for jpeg in jpegs]
+    return np.stack([np.asarray(image) for image in images])
 
 
 def make_gallery(
@@ -122,7 +116,6 @@ def make_gallery(
     image_size: tuple[int, int] = (240, 320),
     first_seed: int = FIRST_SEED,
     workers: int = 2,
-    progress: bool = True,
 ) -> Path:
     """Picture the expert of every task in every setting and write `gallery.md`, which shows it all.
 
@@ -133,7 +126,6 @@ def make_gallery(
         image_size: (H, W) of the stills; the GIFs are smaller.
         first_seed: the first seed from here on that the expert solves is shown.
         workers: simulator processes.
-        progress: whether to show a progress line.
 
     Returns:
         The page.
@@ -146,7 +138,7 @@ def make_gallery(
     subjects = [(task, setting) for task in tasks for setting in settings]
     build = partial(Photographer, folder, image_size, first_seed)
     shots: dict[int, Shot] = {}
-    with Progress("gallery", len(subjects), shown=progress) as line:
+    with Progress("gallery", len(subjects)) as line:
         for done in spread(build, "shoot", subjects, workers=workers):
             if done.fault is not None:
                 fix = "Run the command again."

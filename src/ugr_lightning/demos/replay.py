@@ -68,12 +68,7 @@ class Replayer:
         return Replay(recorded.path, recorded.seed, len(recorded.actions), bool(frames[-1].success), deviation)
 
 
-def replay(
-    paths: Sequence[Path],
-    *,
-    workers: int = 2,
-    progress: bool = True,
-) -> list[Replay]:
+def replay(paths: Sequence[Path], *, workers: int = 2) -> list[Replay]:
     """Execute recordings again, each from its own seed and in its own setting.
 
     What is executed is what was executed then, noise included; nothing is rendered.
@@ -81,7 +76,6 @@ def replay(
     Args:
         paths: episodes written by `ugr collect`.
         workers: simulator processes.
-        progress: whether to show a progress line.
 
     Returns:
         One item per path, in order.
@@ -94,7 +88,7 @@ def replay(
         _require_this_version(recorded)
     results: dict[int, Replay] = {}
     worlds = sorted({(recorded.task, recorded.setting) for recorded in recordings})
-    with Progress("replay", len(paths), shown=progress) as line:
+    with Progress("replay", len(paths)) as line:
         for task, setting in worlds:
             members = [i for i, r in enumerate(recordings) if (r.task, r.setting) == (task, setting)]
             open_task = partial(open_simulator, task, setting=setting, render=False)

@@ -17,6 +17,7 @@ from ugr_lightning.demos.noise import Noise
 from ugr_lightning.demos.recorder import Recorder, staged_episode
 from ugr_lightning.errors import DataError
 from ugr_lightning.results.results import EpisodeResult, wilson_interval
+from ugr_lightning.results.tables import as_markdown
 from ugr_lightning.rollout.evaluate import run_episodes
 from ugr_lightning.rollout.spec import RolloutSpec
 from ugr_lightning.sim.registry import open_simulator
@@ -70,14 +71,7 @@ class Performer:
         return Performance(seed, bool(frame.success), steps, motion.hexdigest(), self._simulator.gave_up)
 
 
-def perform(
-    task: str,
-    seeds: Sequence[int],
-    *,
-    setting: str = "demo_clean",
-    workers: int = 1,
-    progress: bool = True,
-) -> list[Performance]:
+def perform(task: str, seeds: Sequence[int], *, setting: str = "demo_clean", workers: int = 1) -> list[Performance]:
     """Let the expert perform some seeds, without pictures.
 
     Returns:
@@ -85,7 +79,7 @@ def perform(
     """
     open_task = partial(open_simulator, task, setting=setting, render=False)
     results: dict[int, Performance] = {}
-    with Progress(f"{task}, {setting}: expert", len(seeds), shown=progress) as line:
+    with Progress(f"{task}, {setting}: expert", len(seeds)) as line:
         for done in spread(partial(Performer, open_task), "perform", seeds, workers=workers):
             if done.fault is not None:
                 line.message(f"Seed {seeds[done.job]} counts as a failure: {done.fault}")
@@ -168,7 +162,6 @@ def survey(
     image_sizes: Sequence[tuple[int, int]] = IMAGE_SIZES,
     first_seed: int = FIRST_SEED,
     workers: int = 2,
-    progress: bool = True,
 ) -> Survey:
     """Measure a task in a setting.
 
@@ -181,15 +174,14 @@ def survey(
         image_sizes: (H, W) each.
         first_seed: of all of these.
         workers: simulator processes; recording is timed in one.
-        progress: whether to show progress lines.
     """
     from ugr_lightning.sim.tasks import all_task_names, task_version
 
     seeds = list(range(first_seed, first_seed + episodes))
-    performances = perform(task, seeds, setting=setting, workers=workers, progress=progress)
+    performances = perform(task, seeds, setting=setting, workers=workers)
     dummies: dict[str, list[EpisodeResult]] = {}
     if dummy_episodes:
-        spec = RolloutSpec(task, seeds[:dummy_episodes], setting, workers=workers, progress=progress)
+        spec = RolloutSpec(task, seeds[:dummy_episodes], setting, workers=workers)
         dummies = {name: run_episodes(name, spec) for name in ("zero", "random")}
     lengths = [item.steps for item in performances if item.success]
     return Survey(
@@ -203,24 +195,17 @@ def survey(
         steps=(round(float(np.mean(lengths)), 1), min(lengths), max(lengths)) if lengths else (0.0, 0, 0),
         failures=tuple(item.seed for item in performances if not item.success),
         recordings=tuple(
-            _time_recording(task, setting, size, seeds[:recordings], progress)
-            for size in (image_sizes if recordings else ())
+            _time_recording(task, setting, size, seeds[:recordings]) for size in (image_sizes if recordings else ())
         ),
         package_version=version("ugr-lightning"),
     )
 
 
-def _time_recording(
-    task: str,
-    setting: str,
-    image_size: tuple[int, int],
-    seeds: Sequence[int],
-    progress: bool,
-) -> RecordingCost:
+def _time_recording(task: str, setting: str, image_size: tuple[int, int], seeds: Sequence[int]) -> RecordingCost:
     open_task = partial(open_simulator, task, setting=setting, image_size=image_size)
     seconds, sizes = [], []
     title = f"{task}, {setting}: recording at {image_size[1]}x{image_size[0]}"
-    with tempfile.TemporaryDirectory() as scratch, Progress(title, len(seeds), shown=progress) as line:
+    with tempfile.TemporaryDirectory() as scratch, Progress(title, len(seeds)) as line:
         staging = Path(scratch)
         with Worker(partial(Recorder, open_task, Noise(), staging), "recording process") as worker:
             start_all([worker])
@@ -240,23 +225,19 @@ def survey_table(rows: Sequence[dict[str, Any]]) -> str:
     sizes = sorted({tuple(cost["image_size"]) for row in rows for cost in row["recordings"]})
     heads = ["task", "setting", "expert", "steps (range)", "`zero`", "`random`"]
     heads += [f"{unit} at {width}x{height}" for height, width in sizes for unit in ("s", "MB")]
-    lines = [f"| {' | '.join(heads)} |", "|" + "---|" * len(heads)]
+    table = [heads]
     for row in rows:
         mean, shortest, longest = row["steps"]
-        cells = [
-            row["task"],
-            row["setting"],
-            str(MeasuredRate(**row["expert"])),
-            f"{mean:.0f} ({shortest} to {longest})",
-        ]
+        expert = str(MeasuredRate(**row["expert"]))
+        cells = [row["task"], row["setting"], expert, f"{mean:.0f} ({shortest} to {longest})"]
         cells += [str(MeasuredRate(**row[name])) for name in ("zero", "random")]
         costs = {tuple(cost["image_size"]): cost for cost in row["recordings"]}
         for size in sizes:
             cost = costs.get(size)
             cells += ["", ""] if cost is None else [f"{cost['seconds']:.1f}", f"{cost['megabytes']:.2f}"]
-        lines.append(f"| {' | '.join(cells)} |")
+        table.append(cells)
     starts = ", ".join(sorted({str(row["first_seed"]) for row in rows}))
-    return "\n".join(lines) + (
+    return as_markdown(table) + (
         f"\n\nSuccesses with 95 % Wilson intervals in per cent, seeds from {starts} upward. Steps are those of the "
         "expert's successful episodes at 25 Hz. Seconds and megabytes are those of one recorded episode, one process.\n"
     )

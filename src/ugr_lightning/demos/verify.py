@@ -38,7 +38,6 @@ def verify_determinism(
     episodes: int = 50,
     first_seed: int = FIRST_SEED,
     workers: int = 2,
-    progress: bool = True,
 ) -> Verification:
     """Let the expert do the same seeds twice, in opposite order and in different processes.
 
@@ -50,25 +49,18 @@ def verify_determinism(
         episodes: number of seeds.
         first_seed: the first of them.
         workers: simulator processes of each of the two runs.
-        progress: whether to show progress lines.
     """
     seeds = list(range(first_seed, first_seed + episodes))
 
     def run(order: Sequence[int]) -> dict[int, Performance]:
-        found = perform(task, order, setting=setting, workers=workers, progress=progress)
-        return {item.seed: item for item in found}
+        return {item.seed: item for item in perform(task, order, setting=setting, workers=workers)}
 
     once, again = run(seeds), run(seeds[::-1])
     differing = tuple(seed for seed in seeds if once[seed] != again[seed] or not once[seed].steps)
     return Verification(f"{task}, {setting}: same seed, same episode", episodes, differing)
 
 
-def verify_evaluation_seeds(
-    task: str,
-    *,
-    workers: int = 2,
-    progress: bool = True,
-) -> Verification:
+def verify_evaluation_seeds(task: str, *, workers: int = 2) -> Verification:
     """Let the expert try every seed of the range that the shipped list covers: it must solve those listed, no other.
 
     Raises:
@@ -76,26 +68,19 @@ def verify_evaluation_seeds(
     """
     shipped = evaluation_seeds(task)
     seeds = list(range(EVALUATION_START, shipped[-1] + 1))
-    found = perform(task, seeds, workers=workers, progress=progress)
+    found = perform(task, seeds, workers=workers)
     differing = tuple(item.seed for item in found if item.success != (item.seed in set(shipped)))
     what = f"{task}: {len(shipped)} evaluation seeds (hash {seeds_hash(shipped)[:12]}) and what the expert solves"
     return Verification(what, len(seeds), differing)
 
 
-def find_evaluation_seeds(
-    task: str,
-    *,
-    count: int,
-    workers: int = 2,
-    progress: bool = True,
-) -> Path:
+def find_evaluation_seeds(task: str, *, count: int, workers: int = 2) -> Path:
     """Write the list of a task's evaluation seeds: the first from 100000 upward that the expert solves without noise.
 
     Args:
         task: a name from `ugr tasks`.
         count: how many.
         workers: simulator processes.
-        progress: whether to show progress lines.
 
     Returns:
         The file, see `sim.tasks.seeds_file`.
@@ -109,7 +94,7 @@ def find_evaluation_seeds(
     while len(solved) < count:
         start = EVALUATION_START + len(solved) + len(skipped)
         seeds = range(start, start + count - len(solved))
-        for item in perform(task, seeds, workers=workers, progress=progress):
+        for item in perform(task, seeds, workers=workers):
             (solved if item.success else skipped).append(item.seed)
         if len(skipped) > len(solved):
             got = f"failures on {len(skipped)} of {len(solved) + len(skipped)}: {shorten(skipped, 5)}"

@@ -8,6 +8,7 @@ import numpy as np
 from ugr_lightning.contract import CAMERAS, STATE_DIM
 from ugr_lightning.data.folder import episode_path
 from ugr_lightning.data.formats.robotwin import write_episode
+from ugr_lightning.data.recorded_arrays import CAMERA_PARAMETERS
 
 TASK = "click_alarmclock"
 DIFFERENT = 4
@@ -33,8 +34,7 @@ def write_made_up(
     blocks = steps + 1, len(cameras), -(-height // 8), -(-width // 8), 3
     images = generator.integers(256, size=blocks, dtype=np.uint8).repeat(8, axis=2).repeat(8, axis=3)
     joints = generator.standard_normal((steps + 1, STATE_DIM)).astype(np.float32)
-    shapes = {"intrinsic_cv": (3, 3), "extrinsic_cv": (3, 4), "cam2world_gl": (4, 4)}
-    camera = {key: np.eye(*shape) for key, shape in shapes.items()}
+    camera = {key: np.eye(*shape) for key, shape in CAMERA_PARAMETERS.items()}
     path = episode_path(folder, index)
     write_episode(
         path,

@@ -112,12 +112,11 @@ def recall(error: np.ndarray, score: np.ndarray, budget: int) -> np.ndarray:
     return np.divide(found, worst.sum(1), out=np.full(len(error), np.nan), where=known.any(1))
 
 
-def sparsification(error: np.ndarray, score: np.ndarray, fractions: np.ndarray = FRACTIONS) -> np.ndarray:
-    """Mean error of what remains when the steps with the highest scores are left out, relative to that of all.
+def sparsification(error: np.ndarray, score: np.ndarray) -> np.ndarray:
+    """Mean error of what remains when `FRACTIONS` of the steps, of the highest scores, are left out; relative to all.
 
     Args:
         error, score: (n, K).
-        fractions: (F,) shares left out, in 0 .. 1 without 1.
 
     Returns:
         (F,); the score `error` itself gives the lowest curve that there is.
@@ -126,14 +125,14 @@ def sparsification(error: np.ndarray, score: np.ndarray, fractions: np.ndarray =
     """
     known = ~np.isnan(error)
     values = error[known][np.argsort(score[known], kind="stable")]  # the most certain first
-    kept = np.maximum(1, np.round((1 - fractions) * len(values)).astype(int))
+    kept = np.maximum(1, np.round((1 - FRACTIONS) * len(values)).astype(int))
     return np.cumsum(values)[kept - 1] / kept / values.mean()
 
 
-def ause(error: np.ndarray, score: np.ndarray, fractions: np.ndarray = FRACTIONS) -> float:
+def ause(error: np.ndarray, score: np.ndarray) -> float:
     """Area between the sparsification curves of the score and of the error itself; 0 is perfect."""
-    gap = sparsification(error, score, fractions) - sparsification(error, error, fractions)
-    return float(np.trapezoid(gap, fractions))
+    gap = sparsification(error, score) - sparsification(error, error)
+    return float(np.trapezoid(gap, FRACTIONS))
 
 
 def gaussian_nll(error: np.ndarray, log_variance: np.ndarray) -> np.ndarray:
@@ -154,24 +153,23 @@ def gaussian_nll(error: np.ndarray, log_variance: np.ndarray) -> np.ndarray:
     return 0.5 * (np.log(2 * np.pi) + log_variance + np.square(error) * np.exp(-log_variance))
 
 
-def coverage(error: np.ndarray, log_variance: np.ndarray, levels: tuple[float, ...] = LEVELS) -> np.ndarray:
-    """Share of the steps whose error lies in the central interval that holds each nominal share of the Gaussian.
+def coverage(error: np.ndarray, log_variance: np.ndarray) -> np.ndarray:
+    """Share of the steps whose error lies in the central interval that holds each of `LEVELS` of the Gaussian.
 
     Args:
         error: (n, K).
         log_variance: broadcastable to (n, K).
-        levels: L nominal shares.
 
     Returns:
         (L,); equal to the levels where the variances are right and the errors Gaussian.
     """
     known = ~np.isnan(error)
     deviations = (error * np.exp(-np.broadcast_to(log_variance, error.shape) / 2))[known]
-    return np.array([float(np.mean(deviations <= stats.norm.ppf((1 + level) / 2))) for level in levels])
+    return np.array([float(np.mean(deviations <= stats.norm.ppf((1 + level) / 2))) for level in LEVELS])
 
 
 def bootstrap(
-    statistics: Callable[[np.ndarray], np.ndarray], episode: np.ndarray, resamples: int = 500, seed: int = 0
+    statistics: Callable[[np.ndarray], np.ndarray], episode: np.ndarray, resamples: int = 500
 ) -> list[Interval]:
     """Statistics and their 95 % percentile intervals when whole episodes are drawn with replacement.
 
@@ -181,7 +179,6 @@ def bootstrap(
         statistics: takes row numbers of the arrays, gives J numbers at once, so that their differences share draws.
         episode: (n,) which episode each row is from.
         resamples: how many draws.
-        seed: of the draws.
 
     Returns:
         J intervals; a number that is NaN in all draws has NaN limits.
@@ -194,7 +191,7 @@ def bootstrap(
     rows = [np.flatnonzero(episode == name) for name in np.unique(episode)]
     if len(rows) < 2:
         raise DataError("validation", "at least 2 episodes", len(rows), "Record and split more demonstrations.")
-    draws = np.random.default_rng(seed).integers(len(rows), size=(resamples, len(rows)))
+    draws = np.random.default_rng(0).integers(len(rows), size=(resamples, len(rows)))
     drawn = np.stack([statistics(np.concatenate([rows[index] for index in draw])) for draw in draws])  # (R, J)
     values = statistics(np.arange(len(episode)))
     limits = [np.nanpercentile(one, (2.5, 97.5)) if (~np.isnan(one)).any() else (np.nan, np.nan) for one in drawn.T]

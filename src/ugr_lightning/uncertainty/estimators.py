@@ -24,7 +24,7 @@ Draw = Callable[[Observation], Chunk]
 
 
 def sampled_deviation(
-    draw: Draw, data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, samples: int, batch_size: int = 16
+    draw: Draw, data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, samples: int
 ) -> np.ndarray:
     """How far repeated predictions of one chunk scatter, in standard deviations of the training actions.
 
@@ -34,14 +34,13 @@ def sampled_deviation(
         episodes: which episodes; the order of the result is that of `predictions.predict`.
         stride: control steps between two queries.
         samples: predictions of each chunk.
-        batch_size: queries at once.
 
     Returns:
         (n, K) root of the variance, summed over the action, of the coarse actions.
     """
     std = data.statistics.action_std  # (A,)
     found = []
-    for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
+    for batch in batches(data, episodes, stride=stride):
         chunks = [draw(batch.observation) for _ in range(samples)]
         actions = torch.stack([chunk.actions if chunk.coarse is None else chunk.coarse for chunk in chunks])
         found.append((actions.float() / std).var(0).sum(-1).sqrt())  # (B, K)
@@ -93,20 +92,14 @@ def estimate(
     episodes: tuple[int, ...],
     *,
     stride: int,
-    samples: int = 8,
-    probability: float = 0.1,
-    seed: int = 0,
 ) -> dict[str, np.ndarray]:
-    """Every estimate, by name, on some episodes.
+    """Every estimate, by name, on some episodes; the state of the global random generator is put back.
 
     Args:
         policy: in evaluation mode, with its CVAE's decoder.
         data: after `setup`.
         episodes: which episodes.
         stride: control steps between two queries.
-        samples: predictions of each chunk.
-        probability: dropout in layers that were trained without it.
-        seed: of the random numbers; the state of the global generator is put back.
     """
     std = data.statistics.action_std.numpy()  # (A,)
     frames = data.data.frames.of(episodes, stride)
@@ -117,12 +110,11 @@ def estimate(
     def sampled_style(observation: Observation) -> Chunk:
         return policy.predict(observation, torch.randn(len(observation.state), policy.latent_dim))
 
-    options = {"stride": stride, "samples": samples}
     with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        styles = sampled_deviation(sampled_style, data, episodes, **options)
-        with dropout_on(policy, probability):
-            dropped = sampled_deviation(policy.predict, data, episodes, **options)
+        torch.manual_seed(0)
+        styles = sampled_deviation(sampled_style, data, episodes, stride=stride, samples=8)
+        with dropout_on(policy, 0.1):
+            dropped = sampled_deviation(policy.predict, data, episodes, stride=stride, samples=8)
     overlap = disagreement(actions / std, episode, step)
     return {"MC dropout": dropped, "CVAE samples": styles, "overlapping chunks": overlap}
 

@@ -17,6 +17,9 @@ from ugr_lightning.rollout.overlap import HORIZON, Overlap, near_disagreement
 from ugr_lightning.rollout.traces import PredictionTrace
 from ugr_lightning.uncertainty.calibration import Interval
 
+FALSE_ALARM_RATE = 0.1
+"""Largest probability of an alarm in a successful episode."""
+
 Score = Callable[[PredictionTrace], np.ndarray]
 """What an alarm goes by: (Q,), a number for each query, higher where more trouble is expected; NaN if unknown."""
 
@@ -32,7 +35,6 @@ class Alarms(NamedTuple):
         detected: share of failures with an alarm.
         lead: median control steps between the alarm and the end of a failed episode that had one; NaN without any.
         auroc: probability that a failed episode's highest score is above a successful one's, with an interval.
-        level: largest probability of an alarm in a successful episode that was asked for.
     """
 
     threshold: float
@@ -43,14 +45,13 @@ class Alarms(NamedTuple):
     detected: float
     lead: float
     auroc: Interval
-    level: float
 
     def __str__(self) -> str:
         when = "" if math.isnan(self.lead) else f", {self.lead:.0f} steps (median) before their end"
         return (
             f"A threshold of {self.threshold:.3g} from {self.calibration} successful episodes raises an alarm in "
-            f"{self.false_alarms:.0%} of {self.successes} other successes ({self.level:.0%} expected at most) and in "
-            f"{self.detected:.0%} of {self.failures} failures{when}; AUROC {self.auroc}, 0.5 by chance."
+            f"{self.false_alarms:.0%} of {self.successes} other successes ({FALSE_ALARM_RATE:.0%} expected at most) "
+            f"and in {self.detected:.0%} of {self.failures} failures{when}; AUROC {self.auroc}, 0.5 by chance."
         )
 
 
@@ -98,12 +99,7 @@ def auroc(failed: np.ndarray, succeeded: np.ndarray) -> float:
 
 
 def detect_failures(
-    traces: Sequence[PredictionTrace],
-    score: Score = uncertainty_score,
-    *,
-    level: float = 0.1,
-    seed: int = 0,
-    resamples: int = 500,
+    traces: Sequence[PredictionTrace], score: Score = uncertainty_score, *, resamples: int = 500
 ) -> Alarms:
     """Set a threshold on half of the successful episodes and try it on all other episodes.
 
@@ -113,8 +109,6 @@ def detect_failures(
     Args:
         traces: episodes of one policy, task and execution, each seed once.
         score: what the alarm goes by.
-        level: largest probability of an alarm in a successful episode.
-        seed: of the halves and of the bootstrap.
         resamples: draws of the bootstrap over episodes.
 
     Raises:
@@ -126,13 +120,13 @@ def detect_failures(
         got = f"{len(good)} and {len(bad)}"
         raise DataError("traces", "at least 4 successful and 2 failed episodes", got, "Roll out more of them.")
     until = int(np.median([trace.steps for trace in good]))
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     order = rng.permutation(len(good))
     half = len(good) // 2
     scored = [[scores_until(trace, score, until) for trace in part] for part in (good, bad)]
     paths = [[np.maximum.accumulate(values) for _, values in part] for part in scored]
     highest_good, highest_bad = (np.array([path[-1] if len(path) else -np.inf for path in part]) for part in paths)
-    threshold = conformal_threshold(highest_good[order[:half]], level)
+    threshold = conformal_threshold(highest_good[order[:half]], FALSE_ALARM_RATE)
     held_out = highest_good[order[half:]]
     leads = [
         trace.steps - int(query[int(np.argmax(path > threshold))])
@@ -152,5 +146,4 @@ def detect_failures(
         detected=len(leads) / len(bad),
         lead=float(np.median(leads)) if leads else float("nan"),
         auroc=Interval(auroc(highest_bad, held_out), float(low), float(high)),
-        level=level,
     )

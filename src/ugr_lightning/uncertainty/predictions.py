@@ -16,6 +16,8 @@ from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.errors import DataError
 from ugr_lightning.models.checkpoint import TrainingData
 
+AT_ONCE = 16
+
 
 class Predictions(NamedTuple):
     """Errors and uncertainties of n chunks, in standard deviations of the training actions; NaN on padded steps.
@@ -42,14 +44,7 @@ class Predictions(NamedTuple):
     keyframe: np.ndarray | None = None
 
 
-def predict(
-    policy: ChunkPolicy,
-    data: ChunkDataModule,
-    episodes: tuple[int, ...],
-    *,
-    stride: int = 5,
-    batch_size: int = 16,
-) -> Predictions:
+def predict(policy: ChunkPolicy, data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int = 5) -> Predictions:
     """Query a policy on every `stride`-th step of some episodes.
 
     Args:
@@ -57,14 +52,13 @@ def predict(
         data: after `setup`.
         episodes: positions of the episodes.
         stride: control steps between two queries.
-        batch_size: queries at once.
 
     Returns:
         Predictions in the order of episode and step.
     """
     std = data.statistics.action_std  # (A,)
     parts: list[Predictions] = []
-    for batch in batches(data, episodes, stride=stride, batch_size=batch_size):
+    for batch in batches(data, episodes, stride=stride):
         with torch.no_grad():
             chunk = policy.predict(batch.observation)
 
@@ -93,18 +87,17 @@ def predict(
     return Predictions(*whole)
 
 
-def batches(data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int, batch_size: int = 16) -> Iterator[Batch]:
+def batches(data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int) -> Iterator[Batch]:
     """What was seen and done at every `stride`-th step of some episodes, in order.
 
     Args:
         data: after `setup`.
         episodes: positions of the episodes.
         stride: control steps between two samples.
-        batch_size: samples at once.
     """
     frames = data.data.frames.of(episodes, stride)
-    for start in range(0, len(frames), batch_size):
-        yield data.data.__getitems__(frames[start : start + batch_size].tolist())
+    for start in range(0, len(frames), AT_ONCE):
+        yield data.data.__getitems__(frames[start : start + AT_ONCE].tolist())
 
 
 def open_data(

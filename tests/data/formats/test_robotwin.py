@@ -144,7 +144,7 @@ def test_a_failure_while_writing_leaves_no_file_and_keeps_the_old_one(tmp_path, 
     def fail(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(robotwin, "_write_robot", fail)
+    monkeypatch.setattr(robotwin, "_write_joints", fail)
     for target in (path, episode_path(tmp_path, 1)):
         with pytest.raises(KeyboardInterrupt):
             write_episode(target, **arrays(seed=2))

@@ -63,6 +63,9 @@ class XPolicyModel:
             `environments` (how many are remembered).
         folder: the adapter's folder, which relative checkpoints are in.
 
+    Attributes:
+        environments: how many are remembered at most.
+
     Raises:
         ConfigError: a value that cannot work.
         CheckpointError: no usable checkpoint.
@@ -72,17 +75,12 @@ class XPolicyModel:
         if text(model_cfg, "action_type", "joint") != "joint":
             fix = "Evaluate with action_type joint: the policy commands joint targets."
             raise ConfigError("action_type", "joint", model_cfg["action_type"], fix)
-        self._count = count = int(number(model_cfg, "environments") or ENVIRONMENTS)
+        self.environments = count = int(number(model_cfg, "environments") or ENVIRONMENTS)
         checkpoint = find_checkpoint(model_cfg, folder or Path())
         self.deployment = deployment_of(model_cfg, checkpoint, cameras=CAMERAS, calibration=CALIBRATION, slots=count)
         self._free = list(reversed(range(count)))
         self._environments: dict[tuple[Hashable, int], Environment] = {}  # least recently used first
         self._latest: dict[tuple[Hashable, Hashable], list[int]] = {}  # by session and connection
-
-    @property
-    def environments(self) -> int:
-        """How many are remembered at most."""
-        return self._count
 
     def update_obs(self, obs: Mapping[str, Any], *, session: Hashable = "", client: Hashable = None) -> None:
         """The newest observation of one environment; `session` and `client` as for `infer`."""
@@ -94,9 +92,9 @@ class XPolicyModel:
         """The newest observations of some environments; earlier ones that nobody asked about are dropped."""
         if not isinstance(obs_list, (list, tuple)):
             raise ProtocolError("obs", "a list of observations", type(obs_list).__name__, "Send one per environment.")
-        if len(obs_list) > self._count:
+        if len(obs_list) > self.environments:
             fix = "Raise `environments` in deploy.yml."
-            raise ConfigError("environments", f"at most {self._count} at once", len(obs_list), fix)
+            raise ConfigError("environments", f"at most {self.environments} at once", len(obs_list), fix)
         seen = [(environment_index(obs), self._see(obs)) for obs in obs_list]
         for index, (observation, joints) in seen:
             environment = self._environment((session, index), client)
@@ -199,7 +197,7 @@ class XPolicyModel:
                 one.client = None
         for session, connection in [key for key in self._latest if key[1] == client]:
             self._latest[session, None] = self._latest.pop((session, connection))
-        while len(self._latest) > self._count:
+        while len(self._latest) > self.environments:
             self._latest.pop(next(iter(self._latest)))
 
     def _observed_last(self, session: Hashable, client: Hashable) -> list[int]:

@@ -139,7 +139,11 @@ def write_episode(
         texts = {"task": task, "setting": setting, "noise": json.dumps(dict(noise or {}), sort_keys=True)}
         for name, text in {**texts, "package_version": version("ugr-lightning")}.items():
             file.attrs[name] = np.bytes_(text.encode())  # fixed width: see `read_attribute`
-        _write_robot(file, commanded, endpose)
+        _write_joints(file, commanded)
+        for pose, side in enumerate(("left", "right")):
+            file[f"endpose/{side}_endpose"] = endpose[:, pose]
+            if f"joint_action/{side}_gripper" in file:  # a robot of one arm has the left one
+                file[f"endpose/{side}_gripper"] = file[f"joint_action/{side}_gripper"][()]
         for camera in cameras:
             group = file.create_group(f"observation/{DISK_CAMERAS.get(camera, camera)}")
             group["rgb"] = np.array(jpegs[camera], dtype=bytes)  # (N + 1,) S{longest}, padded with NUL
@@ -151,15 +155,6 @@ def write_episode(
         file["ugr/phase"] = np.array([name.encode() for name in phase])
 
     write_hdf5(path, fill)
-
-
-def _write_robot(file: h5py.File, commanded: np.ndarray, endpose: np.ndarray) -> None:
-    """`joint_action/*` and `endpose/*`, all float64."""
-    _write_joints(file, commanded)
-    for pose, side in enumerate(("left", "right")):
-        file[f"endpose/{side}_endpose"] = endpose[:, pose]
-        if f"joint_action/{side}_gripper" in file:  # a robot of one arm has the left one
-            file[f"endpose/{side}_gripper"] = file[f"joint_action/{side}_gripper"][()]
 
 
 def read_episode(

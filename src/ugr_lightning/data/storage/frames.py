@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from PIL import Image
 
-MAX_PIXELS = 4096
+MAX_PIXELS = 4096  # a side of a picture that comes from elsewhere
 
 
 class FrameSource(ABC):

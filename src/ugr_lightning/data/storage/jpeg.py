@@ -11,8 +11,9 @@ import numpy as np
 import simplejpeg
 from PIL import Image
 
+from ugr_lightning.data.storage.frames import MAX_PIXELS
+
 QUALITY = 95
-LARGEST = 4096  # pixels a side of a picture that comes from elsewhere
 RGB_MARKER = b"XPL-RGB1"
 _COMMENT, _SCAN, _WITHOUT_LENGTH = 0xFE, 0xDA, {0x01, *range(0xD0, 0xD9)}  # codes of segments
 
@@ -102,7 +103,7 @@ def decode_picture(data: bytes) -> np.ndarray:
 
 
 def _sensible(size: tuple[int, int]) -> tuple[int, int]:
-    if not 0 < min(size) <= max(size) <= LARGEST:
+    if not 0 < min(size) <= max(size) <= MAX_PIXELS:
         raise ValueError(f"a picture of {size}")
     return size
 

@@ -25,9 +25,7 @@ SAMPLED = 100  # pictures of an episode that its statistics are taken from
 SAMPLED_SIDE = 150  # pixels a side, about, that are looked at
 
 
-def write_dataset(
-    folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None, fps: int | None = None
-) -> None:
+def write_dataset(folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None) -> None:
     """Write episodes as a dataset that lerobot reads.
 
     Every episode has files of its own, and its row in `meta/episodes` comes last: stopped at any time, the next call
@@ -38,7 +36,6 @@ def write_dataset(
         folder: where to; a new folder, or one that a call with the same episodes was stopped in.
         episodes: what to write, with the same cameras and dimensions.
         done: called with the index of every episode that is on disk.
-        fps: steps per second; None for what the episodes say, `control_hz`.
 
     Raises:
         DataError: episodes that differ, that do not say their rate, or a folder with another dataset.
@@ -47,7 +44,7 @@ def write_dataset(
     import_pyarrow(), import_av()
     if not episodes:
         raise ConfigError("episodes", "at least one", "none", "Choose some.")
-    rate, features = _rate(episodes, fps), _features(episodes)
+    rate, features = _rate(episodes), _features(episodes)
     tasks = list(dict.fromkeys(map(_task, episodes)))
     starts = np.cumsum([0] + [episode.length for episode in episodes])
     info = _info(features, rate, len(episodes), int(starts[-1]), len(tasks))
@@ -69,11 +66,11 @@ def _path(pattern: str, index: int, key: str = "") -> str:
     return pattern.format(video_key=key, chunk_index=index // CHUNK, file_index=index % CHUNK)
 
 
-def _rate(episodes: Sequence[Episode], fps: int | None) -> int:
-    said = {episode.extras.get("control_hz") if fps is None else fps for episode in episodes}
+def _rate(episodes: Sequence[Episode]) -> int:
+    said = {episode.extras.get("control_hz") for episode in episodes}
     rate = next(iter(said))
     if len(said) > 1 or not isinstance(rate, (int, float)) or rate < 1 or rate != int(rate):
-        expected, fix = "episodes that say one rate in whole steps per second", "State it (`fps`, or `--rate`)."
+        expected, fix = "episodes that say one rate in whole steps per second", "State it with `--rate`."
         raise DataError(episodes[0].path.parent, expected, " and ".join(sorted(map(str, said))), fix)
     return int(rate)
 
