@@ -87,7 +87,9 @@ POLICIES: dict[str, Callable[[], ChunkPolicy]] = {
     "a decoder branch, noise and jitter": lambda: act(
         refine=Uncertainty(), refine_branch="decoder", state_noise=0.1, color_jitter=0.2
     ),
-    "a second look": lambda: act(keyframes=KeyframeSettings(zoom=16, zoom_levels=2), mirror=0.5, image_shift=4, color_jitter=0.2),
+    "a second look": lambda: act(
+        keyframes=KeyframeSettings(zoom=16, zoom_levels=2), mirror=0.5, image_shift=4, color_jitter=0.2
+    ),
     "diffusion with a history": lambda: DiffusionPolicy(
         diffusion_steps=2, sampling_steps=2, unet_widths=(16, 32), backbone_width=8, precision="fp32"
     ),

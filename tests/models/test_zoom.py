@@ -136,6 +136,22 @@ def test_a_crop_is_cut_into_eighths_and_smaller_than_a_picture(side):
         KeyframeSettings(zoom=side)
 
 
+def test_each_level_of_each_camera_has_eyes_of_its_own():
+    finder = KeyframeFinder(KeyframeSettings(channels=8, zoom=8, zoom_levels=3), (8, 16, 32), 2)
+    assert len(finder.zoom.eyes) == 6
+
+
+@pytest.mark.parametrize("levels", [1, 2])
+def test_the_second_level_sees_what_is_outside_the_first(levels):
+    torch.manual_seed(0)
+    zoom = Zoom(8, 1, 6, levels).eval()
+    dark, place = torch.zeros(1, 1, 3, HEIGHT, WIDTH, dtype=torch.uint8), torch.zeros(1, 2, 3)
+    bright_around = torch.full_like(dark, 255)
+    bright_around[..., HEIGHT // 2 - 5 : HEIGHT // 2 + 5, WIDTH // 2 - 5 : WIDTH // 2 + 5] = 0
+    answers = [zoom(seen, ABOVE[None, None], place, place, torch.zeros(1, 2)).axes for seen in (dark, bright_around)]
+    assert torch.equal(*answers) == (levels == 1)
+
+
 def test_levels_are_few():
     with pytest.raises(ConfigError, match=r"keyframes\.zoom_levels: expected 1 to 4"):
         KeyframeSettings(zoom=8, zoom_levels=0)
