@@ -143,6 +143,8 @@ def test_maps_learn_a_place_and_moving_the_picture_moves_the_label(finder, proje
         optimiser.step()
     found = finder.eval()(stages, projection, shift, GRIPS, DARK, keyframes)
     assert found.terms["keyframe_px"] < 4  # a cell
+    finer = finder(stages, projection, shift, GRIPS, DARK.repeat(1, 1, 1, 2, 2), keyframes)
+    assert finer.terms["keyframe_px"] == 2 * found.terms["keyframe_px"] > 0
     expected, inside = places_of(keyframes, projection)
     seen = inside & (moved.unflatten(0, (2, 3)).abs().amax(-1) < 1)
     place, _, _ = peak(found.maps.flatten(0, 1).flatten(1, 2))  # (6, 4, 2)
