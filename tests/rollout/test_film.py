@@ -71,6 +71,17 @@ def test_gif_has_all_frames_at_the_right_speed(tmp_path):
     assert [path.name for path in (tmp_path / "new").iterdir()] == ["a.gif"]
 
 
+def test_wide_films_are_halved_as_gif_and_still_say_the_step(tmp_path):
+    wide = np.zeros((2, 3, 240, 320, 3), np.uint8)
+    write_video(tmp_path / "a.gif", compose_frames(list(wide), success=[False, True]))
+    with Image.open(tmp_path / "a.gif") as gif:
+        said = np.asarray(gif.convert("RGB"))
+        assert said.shape == (120, 480, 3)
+        assert (said[:14, :14].max(axis=(1, 2)) > 90).sum() >= 7, "a digit is so many pixels high"
+        gif.seek(1)
+        assert np.asarray(gif.convert("RGB"))[60, 0, 1] > 150
+
+
 def test_mp4_plays_even_with_odd_sizes(tmp_path):
     write_video(tmp_path / "a.mp4", compose_frames(images()), fps=25)
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))

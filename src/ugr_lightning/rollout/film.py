@@ -12,6 +12,8 @@ from ugr_lightning.errors import ConfigError
 from ugr_lightning.system.files import publish
 
 STRIP_HEIGHT = 12
+GIF_WIDTH = 640
+"""Wider films are halved, or made smaller still, as GIF: it hardly compresses."""
 SUCCESS_COLOUR, ALARM_COLOUR, TEXT_COLOUR = (40, 170, 70), (220, 40, 40), (255, 255, 255)
 CERTAIN = 0.1
 """Probability of a cell of a map from which on it is drawn at full strength."""
@@ -48,10 +50,11 @@ def compose_frames(
         done = bool(success[step]) if success is not None else False
         alarmed = alarm is not None and step >= alarm
         said = f"{step}{'  alarm' if alarmed else ''}{'  success' if done else ''}"
-        drawing.text((3, 1), said, fill=TEXT_COLOUR, stroke_width=1, stroke_fill=(0, 0, 0))
+        scale = -(-picture.width // GIF_WIDTH)
+        drawing.text((3, 1), said, TEXT_COLOUR, font_size=10 * scale, stroke_width=scale, stroke_fill=(0, 0, 0))
         if done or alarmed:
             colour = SUCCESS_COLOUR if done else ALARM_COLOUR
-            drawing.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=colour, width=2)
+            drawing.rectangle((0, 0, picture.width - 1, picture.height - 1), outline=colour, width=2 * scale)
         frame = np.asarray(picture)
         if known and log_variance is not None:
             frame = np.concatenate([frame, _strip(log_variance[step], frame.shape[1], float(low), float(high))])
@@ -143,7 +146,9 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, *, 
 
 
 def _write_gif(path: Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> None:
-    """One palette for all frames: Pillow then stores only what changes, a third of the size."""
+    """One palette for all frames: Pillow then stores only what changes, a third of the size; wide ones are shrunk."""
+    shrink = -(-frames[0].shape[1] // GIF_WIDTH)
+    frames = [np.asarray(Image.fromarray(frame).reduce(shrink)) for frame in frames]
     sample = np.concatenate(list(frames[:: max(1, len(frames) // 4)]))
     palette = Image.fromarray(sample).quantize(128, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
