@@ -1,6 +1,7 @@
 """The data module records what is missing, splits, and gives the same batches however they are loaded or resumed."""
 
 import lightning
+import numpy as np
 import pytest
 import torch
 from jsonargparse import ArgumentParser
@@ -50,6 +51,15 @@ def test_batches_do_not_depend_on_the_number_of_workers_or_the_cache(recording_r
     assert _same(alone, _epochs(_ready(recording_root, cache="memmap", num_workers=2)))
     assert _same(alone, _epochs(_ready(recording_root, cache="none")))
     assert not _same(alone, _epochs(_ready(recording_root, seed=1)))
+
+
+def test_rests_are_left_out_of_training_and_validation_alike(tmp_path):
+    resting = np.float32([0, 0, 0, 1, 1, 1, 2, 3])[:, None].repeat(14, axis=1)
+    record(tmp_path, longer=0, commanded=resting)
+    data = _ready(tmp_path, sampling=Sampling(rest=0.05), val_stride=1)
+    trained = torch.cat([batch.step for batch in _epochs(data, 1)]).tolist()
+    assert sorted(trained) == sorted([0, 2, 2, 5, 5, 5, 6] * 4)  # as many samples as frames
+    assert torch.cat([batch.step for batch in data.val_dataloader()]).tolist() == [0, 2, 5, 6]
 
 
 def test_training_and_validation_never_share_an_episode(recording_root):

@@ -66,7 +66,35 @@ def test_the_share_of_first_frames_is_as_asked():
     assert set(only.tolist()) == {0, 17, 30}
 
 
-@pytest.mark.parametrize("options", [{"mode": "all"}, {"samples_per_epoch": 0}, {"first_frame_share": 1.1}])
+RESTING = np.array([0, 0, 0, 2, 2, 2.5, 4, 6, 0, 1, 1, 1, 2, 2, 2])[:, None] * [1, 0.5]  # 8 and 7 frames
+
+
+@pytest.mark.parametrize(
+    ("rest", "expected"),
+    [
+        (0.1, [0, 2, 2, 4, 4, 5, 6, 7, 8, 11, 11, 11, 12, 13, 14]),
+        (0.6, [0, 2, 2, 5, 5, 5, 6, 7, 8, 11, 11, 11, 12, 13, 14]),  # as far as from each frame itself
+        (1.1, [0, 2, 2, 5, 5, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14]),  # the second rests until its end
+        (0.0, list(range(15))),
+    ],
+)
+def test_what_stands_for_a_rest_is_its_last_frame(rest, expected):
+    assert Frames([8, 7]).after_rest(RESTING, rest).tolist() == expected
+
+
+def test_no_episode_rests_into_the_next_one_or_before_its_first_frame():
+    states = np.zeros((46, 14))
+    assert FRAMES.after_rest(states, 1.0).tolist() == list(range(46))
+    states[6::7, 3] = 1.0
+    stands = FRAMES.after_rest(states, 0.5)
+    np.testing.assert_array_equal(FRAMES.locate(stands)[0], FRAMES.locate(np.arange(46))[0])
+    assert stands[FRAMES.starts].tolist() == FRAMES.starts.tolist()
+
+
+IMPOSSIBLE = [{"mode": "all"}, {"samples_per_epoch": 0}, {"first_frame_share": 1.1}, {"rest": -0.1}, {"rest": np.inf}]
+
+
+@pytest.mark.parametrize("options", IMPOSSIBLE)
 def test_impossible_sampling_is_refused(options):
     with pytest.raises(ConfigError, match=next(iter(options))):
         Sampling(**options)

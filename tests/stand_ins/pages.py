@@ -45,5 +45,5 @@ def command_lines(page: Page) -> list[str]:
 
 
 def overviews(text: str) -> list[tuple[str, str]]:
-    """The tables of results on a page: the folder that a comment names, and the table under it."""
-    return re.findall(r"<!-- overview of (\S+) -->\n\n((?:\|.*\n)+)", text)
+    """The tables of results on a page, whole or some rows: the folder that a comment names, and the table under it."""
+    return re.findall(r"<!-- (?:overview|rows) of (\S+) -->\n\n((?:\|.*\n)+)", text)

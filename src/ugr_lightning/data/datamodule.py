@@ -170,6 +170,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         self.image_size = self.image_size or episodes[0].image_size
         conventions = (self.state, self.action_offset, self.after_end, self.observation_steps)
         self.data = ChunkDataset(episodes, store, self.chunk_length, *conventions)
+        self._after_rest = self.data.frames.after_rest(self.data.states, self.sampling.rest)  # (N,)
         self.demonstrations = episodes
 
     def _find(self) -> tuple[EpisodeFormat | None, dict[int, EpisodeLocation]]:
@@ -253,7 +254,7 @@ class ChunkDataModule(lightning.LightningDataModule):
 
     def train_order(self, epoch: int) -> np.ndarray:
         """The frames of a training epoch, (n,) int64, for all processes together."""
-        return self.data.frames.draw(self.episode_split.train, self.sampling, self.seed, epoch)
+        return self._after_rest[self.data.frames.draw(self.episode_split.train, self.sampling, self.seed, epoch)]
 
     def train_dataloader(self) -> DataLoader:
         """Batches of one epoch of training; continues in the middle of an epoch when the trainer does."""
@@ -264,7 +265,7 @@ class ChunkDataModule(lightning.LightningDataModule):
 
     def val_dataloader(self) -> DataLoader:
         """The fixed grid of (episode, step) over the validation episodes, the same every time."""
-        grid = self.data.frames.of(self.episode_split.validation, self.val_stride)
+        grid = np.unique(self._after_rest[self.data.frames.of(self.episode_split.validation, self.val_stride)])
         return self._loader(lambda epoch: grid)
 
     def _loader(self, order: EpochOrder) -> DataLoader:

@@ -4,6 +4,7 @@ No loader, worker or process keeps a random state, so any number of workers or p
 resumed run continues where it was without a stored loader state.
 """
 
+import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -26,11 +27,14 @@ class Sampling:
             random frame of each training episode per round (the original ACT).
         samples_per_epoch: number of samples in an epoch; None for one round (all frames, or all episodes).
         first_frame_share: share of samples, 0 to 1, replaced by the first frame of a random training episode.
+        rest: a frame from which on the joints stay nearer than this, robot units, is replaced by the last such frame,
+            so that no target says how long to rest on: no picture tells how long it has been. 0 for off.
     """
 
     mode: Literal["uniform", "per_episode"] = "uniform"
     samples_per_epoch: int | None = None
     first_frame_share: float = 0.0
+    rest: float = 0.0
 
     def __post_init__(self) -> None:
         if self.mode not in ("uniform", "per_episode"):
@@ -41,6 +45,8 @@ class Sampling:
         if not 0 <= self.first_frame_share <= 1:
             where = "data.sampling.first_frame_share"
             raise ConfigError(where, "a share from 0 to 1", self.first_frame_share, "Correct the number.")
+        if not 0 <= self.rest < math.inf:
+            raise ConfigError("data.sampling.rest", "0 or a distance above it", self.rest, "Correct the number.")
 
 
 class Frames:
@@ -65,6 +71,31 @@ class Frames:
     def of(self, episodes: Sequence[int], stride: int = 1) -> np.ndarray:
         """Every `stride`-th frame of some episodes from their first on, in order."""
         return np.concatenate([self.starts[e] + np.arange(0, self.lengths[e], stride) for e in episodes])
+
+    def after_rest(self, states: np.ndarray, rest: float) -> np.ndarray:
+        """Which frame stands for each: the last before the joints leave where they are.
+
+        The first frame of an episode stands for itself, as every rollout begins with it; so do those that rest until
+        the end.
+
+        Args:
+            states: (N, S) joints at every frame.
+            rest: how far the joints are from it when they have left, in any dimension, robot units.
+
+        Returns:
+            (N,) int64 frames.
+        """
+        stands = np.arange(len(self))
+        last = np.repeat(self.starts + self.lengths - 1, self.lengths)  # (N,)
+        still, ahead = np.setdiff1d(stands, self.starts), 0  # (n,) frames that the joints have not left so far
+        while len(still):
+            stands[still], ahead = still + ahead, ahead + 1
+            ended = still + ahead > last[still]
+            stands[still[ended]] = still[ended]
+            still = still[~ended]
+            near = np.abs(states[still + ahead] - states[still]) < rest  # (n, S)
+            still = still[near.all(axis=1)]
+        return stands
 
     def draw(self, episodes: Sequence[int], sampling: Sampling, seed: int, epoch: int) -> np.ndarray:
         """The training frames of one epoch, in order.
