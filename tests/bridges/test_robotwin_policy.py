@@ -210,6 +210,8 @@ def test_an_alarm_is_logged_once_an_episode_and_travels_with_a_copied_checkpoint
     environment, observation = begun()
     robotwin.eval(environment, model, observation)
     assert model.deployment.alarms == {}
+    robotwin.write_policy(folder / file.name, folder, execution=2, copy=True)
+    assert (folder / "policy_best.alarm.json").exists(), "copied onto itself it stays as it is"
     robotwin.write_policy(reacher, folder, execution=2, copy=True)
     assert not (folder / "policy_best.alarm.json").exists(), "one without an alarm takes the place of one with it"
 

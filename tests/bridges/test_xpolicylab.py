@@ -263,8 +263,8 @@ def calibrated(environment, step, size, extrinsics=slice(3)):
     return one
 
 
-def asked_directly(policy, one, size):
-    """The chunk that a policy gives for one of XPolicyLab's observations, without a bridge, (K, A)."""
+def shown(policy, one, size):
+    """What a policy sees in one of XPolicyLab's observations, without a bridge."""
     views = [one["vision"][CAMERAS[camera]] for camera in policy.cameras]
     images = np.stack([scaled(view["color"], size) for view in views])  # (V, H, W, 3)
     state = np.concatenate([one["state"][part] for part in one["state"] if part.endswith("joint_state")])
@@ -272,10 +272,15 @@ def asked_directly(policy, one, size):
         image_projection(view["intrinsic_matrix"], view["extrinsics_matrix"][:3], view["color"].shape[:2])
         for view in views
     ]
-    actor, alone = PolicyActor(policy.for_inference()), Sight(images, state, state, np.stack(projection))
-    actor.begin(1, policy.chunk_length)
-    actor.start(0, 0, alone)
-    return actor.act({0: alone})[0].actions
+    return Sight(images, state, state, np.stack(projection))
+
+
+def asked_directly(policy, one, size, slot=0):
+    """The chunk that a policy gives for one of XPolicyLab's observations in one of its slots, (K, A)."""
+    actor, alone = PolicyActor(policy.for_inference()), shown(policy, one, size)
+    actor.begin(slot + 1, policy.chunk_length)
+    actor.start(slot, 0, alone)
+    return actor.act({slot: alone})[slot].actions
 
 
 @pytest.mark.parametrize("extrinsics", [slice(3), slice(4)], ids=["3x4", "4x4"])
@@ -304,6 +309,12 @@ def test_a_policy_with_keyframes_is_told_the_calibration_and_acts_as_asked_direc
     for name, view in one["vision"].items():
         view["extrinsics_matrix"] = other["vision"][name]["extrinsics_matrix"]
     assert not np.array_equal(asked_directly(policy, one, size), expected[0]), "it matters"
+
+
+def test_who_has_the_second_place_may_ask_first():
+    policy, one = looking_act(), calibrated(0, 0, (30, 40), slice(3))
+    second = asked_directly(policy, one, (30, 40), slot=1)
+    assert np.array_equal(second, asked_directly(policy, one, (30, 40)))
 
 
 MALFORMED = {

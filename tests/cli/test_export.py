@@ -84,8 +84,19 @@ def test_keyframes_are_exported_with_the_calibration_as_an_input(tmp_path, monke
     looks = {"keyframes": KeyframeSettings(channels=8, zoom=8, zoom_levels=2), "refine": Full()}
     policy = ACT(**TINY, **sizes, **looks, decoder_layers=1)
     save(policy)
-    assert main(["export", "policy.ckpt", "--to", to, "--out", "folder"]) == 0
+    assert main(["export", "policy.ckpt", "--to", to, "--out", "a folder"]) == 0
     assert "differ by at most" in capsys.readouterr().out
+    card = Path("a folder/README.md").read_text()
+    if to == "safetensors":
+        assert "\nugr test 'a folder'\n" in card
+        return
+    use = card.split("```\n")[1]
+    seen = look(policy)._replace(projection=torch.randn(2, len(policy.cameras), 3, 4))
+    given = seen._asdict() if to == "torch" else {name: value.numpy() for name, value in seen._asdict().items()}
+    done = {**given, "torch": torch, "onnxruntime": to == "onnx" and importlib.import_module("onnxruntime")}
+    exec(use, done)  # as a reader would
+    wanted = in_fp32(policy).predict(seen).actions
+    torch.testing.assert_close(torch.as_tensor(done["actions"]), wanted, atol=1e-4, rtol=1e-4)
 
 
 def test_a_policy_that_samples_and_looks_back_is_exported_too(tmp_path, monkeypatch, capsys):
@@ -107,7 +118,15 @@ def test_the_card_says_what_it_is_and_how_well_it_does(refined):
     append_result("evaluation.jsonl", episode(9, task="other", checkpoint="another"))
     assert main(["export", "policy.ckpt", "--to", "safetensors", "--out", "folder", "--licence", "mit"]) == 0
     card = Path("folder/README.md").read_text()
-    for part in ("license: mit", "click_alarmclock", "train episodes: 2: 0, 2", "3/4 = 75.0%", "[30.1%", sha, "torch "):
+    for part in (
+        "license: mit",
+        "click_alarmclock",
+        "- train episodes: 2: 0, 2",
+        "3/4 = 75.0%",
+        "[30.1%",
+        sha,
+        "torch ",
+    ):
         assert part in card, part
     assert "other" not in card.split("## Success")[1].split("## Versions")[0]
 

@@ -272,6 +272,7 @@ REFUSED = {
     "data.split_seed": "1",
     "data.episodes": "4",
     "data.after_end": "hold",
+    "data.normalise_over": "all",
     "model.policy.init_args.cameras": "[cam_left_wrist, cam_right_wrist, cam_high]",
 }
 

@@ -28,6 +28,15 @@ def test_of_what_sees_only_the_statistics_of_the_demonstrations_are_shown(tmp_pa
     assert "running" not in shown
 
 
+def test_a_damaged_checkpoint_does_not_hide_the_others_of_its_folder(tmp_path, capsys):
+    whole = save(looking_act(), tmp_path / "whole.ckpt").read_bytes()
+    (tmp_path / "half.ckpt").write_bytes(whole[: len(whole) // 2])
+    assert main(["inspect", str(tmp_path)]) == 0
+    half, other = capsys.readouterr().out.splitlines()
+    assert "half.ckpt: damaged" in half
+    assert "whole.ckpt: step" in other
+
+
 def test_inspect_refuses_what_it_does_not_know(tmp_path, capsys):
     torch.save([1], tmp_path / "list.ckpt")
     (tmp_path / "empty").mkdir()

@@ -2,6 +2,7 @@
 
 import pytest
 import torch
+from deployed import tiny_act
 
 from ugr_lightning.contract import CAMERAS, Keyframes, Observation, Statistics
 from ugr_lightning.embodiment import image_projection
@@ -240,6 +241,20 @@ def test_a_mirror_image_of_a_mirror_image_is_the_sample_itself(seen):
         assert torch.allclose(one.float(), other.float())
     twice = mirrored_statistics(mirrored_statistics(statistics))
     assert torch.allclose(twice.state_std, mirrored_statistics(statistics).state_std)
+
+
+@pytest.mark.parametrize(
+    ("robot", "said"),
+    [
+        ({"state_dim": 16, "action_dim": 16}, "14 numbers.*16 and 16"),
+        ({"action_dim": 7}, "14 numbers.*14 and 7"),
+        ({"cameras": ("cam_high", "cam_left_wrist")}, "cam_right_wrist beside cam_left_wrist"),
+    ],
+)
+def test_a_robot_of_which_no_mirror_image_is_known_is_refused(robot, said):
+    with pytest.raises(ConfigError, match=f"^mirror: .*{said}"):
+        tiny_act(fitted=False, mirror=0.5, **robot)
+    assert tiny_act(fitted=False, **robot).mirror == 0
 
 
 def test_mirrored_cameras_see_mirrored_keyframes_at_the_mirrored_place(seen):

@@ -68,6 +68,13 @@ def test_a_single_file_gets_its_training_seed_from_the_config_beside_it(tmp_path
     assert read_labelled("base", path).training_seed == 7
 
 
+@pytest.mark.parametrize("content", ["", "\n"])
+def test_a_file_without_episodes_is_said_to_be_one(tmp_path, content):
+    (tmp_path / "empty.jsonl").write_text(content)
+    with pytest.raises(DataError, match=r"expected episodes, got none. .*ugr rollout"):
+        read_labelled("base", tmp_path / "empty.jsonl")
+
+
 def test_dummies_in_the_file_of_a_demo_are_left_out_and_repetitions_count_once(tmp_path):
     path = tmp_path / "evaluation.jsonl"
     write(path, [0, 0], checkpoint=None, policy="zero")

@@ -23,6 +23,15 @@ def test_last_and_best_are_those_of_the_newest_version_that_has_them(root):
     assert resolve_checkpoint("best", "uncert", root) == root / "uncert" / "version_0" / "policy_best.ckpt"
 
 
+def test_where_no_run_is_named_it_is_the_newest_also_in_a_group(root):
+    assert resolve_checkpoint("last", None, root) == root / "uncert" / "version_2" / "last.ckpt"
+    newest = root / "group" / "base" / "version_0" / "last.ckpt"
+    newest.parent.mkdir(parents=True)
+    newest.touch()
+    os.utime(newest, (2**31, 2**31))
+    assert resolve_checkpoint("last", None, root) == newest
+
+
 def test_a_run_may_be_named_by_its_folder(root):
     folder = root / "uncert" / "version_0"
     assert resolve_checkpoint("last", str(folder), root) == folder / "last.ckpt"

@@ -84,7 +84,7 @@ def write_adapter_folder(
     values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
     values["CHECKPOINT"] = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
     written = _write_folder(template, out, values)
-    if not copy:
+    if not copy or place.resolve() == checkpoint.resolve():
         return written
     if checkpoint.is_dir():
 

@@ -1,5 +1,6 @@
 """Policies of ours for other programs: written aside, read back, compared, and only then put in place."""
 
+import shlex
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -89,7 +90,7 @@ def export_policy(
             policy,
             info,
             name=out.resolve().name,
-            use=_USE[to].format(out=out.name),
+            use=_use(to, out.name, list(inputs(job.observation))),
             results=_results(checkpoint, info),
             licence=licence,
             notes=notes,
@@ -214,12 +215,25 @@ _WRITERS: dict[Target, Callable[[_Job, Path], tuple[Graph, list[str]]]] = {
     "onnx": _onnx,
     "torch": _torch,
 }
-_USE: dict[Target, str] = {
-    "act": "Put `policy_best.ckpt` and `dataset_stats.pkl` where the original code keeps its checkpoints.",
-    "lerobot": "lerobot-eval --policy.path={out} --env.type=...",
-    "safetensors": "ugr test {out}",
-    "onnx": "session = onnxruntime.InferenceSession('{out}/policy.onnx')\n"
-    "actions = session.run(['actions'], {{'images': images, 'state': state}})[0]",
-    "torch": 'actions = torch.export.load("{out}/policy.pt2").module()(images, state)',
-}
-assert set(_WRITERS) == set(_USE) == set(TOLERANCE) == set(get_args(Target))
+
+
+def _use(to: Target, name: str, given: list[str]) -> str:
+    """How to run what was exported into a folder of a name: lines of shell or Python.
+
+    Args:
+        to: what it was exported to.
+        name: of the folder.
+        given: what a graph is asked with.
+    """
+    feed = ", ".join(f"'{part}': {part}" for part in given)
+    return {
+        "act": "Put `policy_best.ckpt` and `dataset_stats.pkl` where the original code keeps its checkpoints.",
+        "lerobot": f"lerobot-eval --policy.path={shlex.quote(name)} --env.type=...",
+        "safetensors": f"ugr test {shlex.quote(name)}",
+        "onnx": f"session = onnxruntime.InferenceSession({f'{name}/policy.onnx'!r})\n"
+        f"actions = session.run(['actions'], {{{feed}}})[0]",
+        "torch": f"actions = torch.export.load({f'{name}/policy.pt2'!r}).module()({', '.join(given)})",
+    }[to]
+
+
+assert set(_WRITERS) == set(TOLERANCE) == set(get_args(Target))

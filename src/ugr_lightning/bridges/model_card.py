@@ -7,6 +7,8 @@ from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.models.checkpoint import PolicyInfo
 from ugr_lightning.results.results import EpisodeResult, success_table
 
+NAMES = {"train": "train episodes", "validation": "validation episodes"}
+
 
 def model_card(
     policy: ChunkPolicy,
@@ -56,7 +58,7 @@ def model_card(
         "",
         f"- cameras, in order: {', '.join(about['cameras'])}",
         *(f"- {key}: {json.dumps(value)}" for key, value in data.items()),
-        *(f"- {part} episodes: {_listed(members)}" for part, members in split.items()),
+        *(f"- {NAMES.get(part, part.replace('_', ' '))}: {_listed(members)}" for part, members in split.items()),
         *([] if data or split else ["- nothing is recorded: the policy was not trained with ugr-lightning"]),
         "",
         "## Training",

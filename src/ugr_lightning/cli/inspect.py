@@ -90,8 +90,11 @@ def _runs(folder: Path) -> list[str]:
 
     lines = []
     for path in sorted(folder.rglob("*.ckpt")):
-        content = read_checkpoint(path, mmap=True)
-        lines.append(f"{path}: step {content.get('global_step')}, {path.stat().st_size / 2**20:.1f} MiB")
+        try:
+            said = f"step {read_checkpoint(path, mmap=True).get('global_step')}"
+        except CheckpointError as error:
+            said = f"damaged, {error.got}"
+        lines.append(f"{path}: {said}, {path.stat().st_size / 2**20:.1f} MiB")
     if not lines:
         from ugr_lightning.data.formats import detect
 

@@ -196,6 +196,6 @@ def left_out(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -> 
     given = episodes[0]
     layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
     back = form.read(form.find(target)[0], given.cameras, layout)
-    known = {"seed": given.seed, "measured": given.measured, **given.extras}
-    kept = {"seed": back.seed, "measured": back.measured, **back.extras}
+    fields = ("seed", "measured", "endpose", "projection")
+    known, kept = ({**{name: getattr(of, name) for name in fields}, **of.extras} for of in (given, back))
     return sorted(name for name, value in known.items() if value is not None and kept.get(name) is None)

@@ -35,6 +35,7 @@ class TrainingData(TypedDict, total=False):
     state: Literal["commanded", "measured"]
     action_offset: int
     after_end: Literal["mask", "hold"]
+    normalise_over: Literal["train", "all"]
     episodes: int | Sequence[int]
     """how many, or their numbers"""
     split_seed: int

@@ -52,7 +52,8 @@ class DiffusionPolicy(PicturePolicy):
         image_shift: largest random displacement of the images in training, in pixels.
         color_jitter: largest random relative change of contrast and brightness in training.
         image_dropout: probability, per sample, of hiding the image features in training, never together with the state.
-        mirror: probability, per sample, of training on the mirror image; for tasks that are symmetric.
+        mirror: probability, per sample, of training on the mirror image; for tasks that are symmetric and
+            arms whose joints are signed as ours are (ViperX).
         keyframes: tell the policy where each hand will grip next, and how that is looked for; null for not at all.
         backbone_fold: pixels on a side of the squares that the `unshuffle` stem folds, 4 or 8.
         precision: arithmetic of the networks: `auto` takes bf16 where the hardware has it, else fp32.

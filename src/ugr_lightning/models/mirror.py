@@ -6,10 +6,30 @@ import torch
 from torch import Tensor
 
 from ugr_lightning.contract import Batch, Keyframes, Statistics
+from ugr_lightning.errors import ConfigError
 
 ARM = 7
 SIGNS = (-1.0, 1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
 """What mirroring does to the joints of an arm: waist, forearm roll and wrist rotation turn the other way round."""
+
+
+def check_mirror(cameras: Sequence[str], state_dim: int, action_dim: int) -> None:
+    """Refuse a robot of which no mirror image is known.
+
+    Args:
+        cameras: names of the cameras.
+        state_dim, action_dim: numbers in the state and in an action.
+
+    Raises:
+        ConfigError: other joints than those of two arms of seven, or one camera of a left and a right one.
+    """
+    fix = "Set the policy's `mirror` to 0."
+    if (state_dim, action_dim) != (2 * ARM, 2 * ARM):
+        got = f"{state_dim} and {action_dim} numbers"
+        raise ConfigError("mirror", f"states and actions of two arms, {2 * ARM} numbers", got, fix)
+    alone = [name for name in cameras if _other_side(name) not in cameras]
+    if alone:
+        raise ConfigError("mirror", f"{_other_side(alone[0])} beside {alone[0]}", "no such camera", fix)
 
 
 def mirror_batch(batch: Batch, chosen: Tensor, cameras: Sequence[str]) -> Batch:
@@ -70,6 +90,9 @@ def _where(chosen: Tensor, new: Tensor, old: Tensor) -> Tensor:
 
 
 def _partners(cameras: Sequence[str]) -> Tensor:
+    return torch.tensor([cameras.index(_other_side(name)) for name in cameras])
+
+
+def _other_side(camera: str) -> str:
     swap = {"left": "right", "right": "left"}
-    names = ["_".join(swap.get(word, word) for word in name.split("_")) for name in cameras]
-    return torch.tensor([cameras.index(name) if name in cameras else at for at, name in enumerate(names)])
+    return "_".join(swap.get(word, word) for word in camera.split("_"))

@@ -14,7 +14,7 @@ from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.augmentation import jitter_colour, shift_images
 from ugr_lightning.models.inference import fold_normalisation, store_weights_as
 from ugr_lightning.models.keyframes import KeyframeFinder, KeyframeSettings, Sighting, missing_keyframes
-from ugr_lightning.models.mirror import mirror_batch, mirrored_statistics
+from ugr_lightning.models.mirror import check_mirror, mirror_batch, mirrored_statistics
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.precision import Precision, autocast
 from ugr_lightning.models.vision import ResNet18
@@ -76,6 +76,8 @@ class PicturePolicy(ChunkPolicy):
             got = f"{state_dropout} and {image_dropout}"
             fix = "Lower one of them: a sample without both has no answer."
             raise ConfigError("state_dropout, image_dropout", "at most 1 together", got, fix)
+        if mirror:
+            check_mirror(cameras, len(normalizer.state_shift), len(normalizer.action_shift))
         self.cameras, self.normalizer = tuple(cameras), normalizer
         self.state_dropout, self.state_noise, self.image_dropout = state_dropout, state_noise, image_dropout
         self.image_shift, self.color_jitter, self.mirror = image_shift, color_jitter, mirror

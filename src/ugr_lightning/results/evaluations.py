@@ -123,6 +123,8 @@ def read_labelled(label: str, path: str | Path) -> Evaluation:
         name, _, which = path.name.rpartition("@")
         path = path.with_name(name)
     everyone = read_results(path)
+    if not everyone:
+        raise DataError(path, "episodes", "none", "Write some with `ugr rollout CHECKPOINT --out` this file.")
     trained = [item for item in everyone if item.checkpoint is not None]
     results = [item for item in (everyone if which else trained or everyone) if _is_meant(item, which)]
     actors = {(item.policy, item.checkpoint) for item in results}

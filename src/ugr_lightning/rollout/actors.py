@@ -293,7 +293,7 @@ class PolicyActor(Actor):
         """What is predicted for what some slots see, in their order; without actions."""
         assert self._images is not None
         if self._sizes is None:
-            self._sizes = self._exact_sizes()
+            self._sizes = self._exact_sizes(slots[0])
         found: list[Decision] = []
         for first in range(0, len(slots), ROWS):
             asking = slots[first : first + ROWS]
@@ -304,13 +304,17 @@ class PolicyActor(Actor):
             found += [Decision(None, *parts) for parts in of_rows]
         return found
 
-    def _exact_sizes(self) -> list[int]:
-        """Numbers of rows at which noise is answered as among `ROWS` rows, bit for bit; and `ROWS`."""
+    def _exact_sizes(self, slot: int) -> list[int]:
+        """Numbers of rows at which noise is answered as among `ROWS` rows, bit for bit; and `ROWS`.
+
+        Args:
+            slot: one that sees something.
+        """
         assert self._images is not None
         noise = torch.Generator().manual_seed(0)
         images = torch.randint(256, (ROWS, *self._images.shape[1:]), generator=noise, dtype=torch.uint8)
-        state = self._state[:1] + 0.1 * torch.randn(ROWS, *self._state.shape[1:], generator=noise)  # (ROWS, T, S)
-        cameras = self._projected([0] * ROWS)  # (ROWS, T, V, 3, 4)
+        state = self._state[[slot]] + 0.1 * torch.randn(ROWS, *self._state.shape[1:], generator=noise)  # (ROWS, T, S)
+        cameras = self._projected([slot] * ROWS)  # (ROWS, T, V, 3, 4)
         whole = self._predict(images, state, cameras)
         sizes = []
         for size in range(1, ROWS):

@@ -114,5 +114,5 @@ def or_best(checkpoint: str | None, run: str | None) -> str | None:
 
 def _newest_run(root: Path) -> str:
     """The run that was written to last; `run` where there is none, which then is not found."""
-    found = sorted(root.glob("*/version_*/*.ckpt"), key=lambda path: path.stat().st_mtime)
+    found = sorted(root.rglob("version_*/*.ckpt"), key=lambda path: path.stat().st_mtime)
     return str(found[-1].parent) if found else "run"
