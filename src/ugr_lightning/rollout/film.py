@@ -148,7 +148,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray] | np.ndarray, *, 
 def _write_gif(path: Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float) -> None:
     """One palette for all frames: Pillow then stores only what changes, a third of the size; wide ones are shrunk."""
     shrink = -(-frames[0].shape[1] // GIF_WIDTH)
-    frames = [np.asarray(Image.fromarray(frame).reduce(shrink)) for frame in frames]
+    frames = [frame[::shrink, ::shrink] for frame in frames]
     sample = np.concatenate(list(frames[:: max(1, len(frames) // 4)]))
     palette = Image.fromarray(sample).quantize(128, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
