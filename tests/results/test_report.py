@@ -78,20 +78,33 @@ def test_policies_without_common_training_seeds_are_not_compared():
 
 
 def test_unknown_training_seeds_are_numbered_and_said():
-    runs = [evaluation("base", [1, 0], training_seed=None), evaluation("base", [1, 1], training_seed=None)]
+    runs = [evaluation("base", [1, 0], training_seed=None, checkpoint=sha) for sha in ("abc", "def")]
     report = build_report(runs)
     assert list(report.rates[0].by_training_seed) == [0, 1]
     assert "`base`" in report.remarks[0]
 
 
 def test_files_of_other_tasks_are_no_other_training_seeds():
-    parts = [drawn("a", 0.5, task=task, training_seed=None) for task in ("mug", "handover_block", "mug")]
+    tasks = ("mug", "handover_block", "mug")
+    parts = [drawn("a", 0.5, task=t, training_seed=None, checkpoint=f"{n}") for n, t in enumerate(tasks)]
     found = build_report([*parts, drawn("b", 0.5, task="handover_block")])
     assert [(rate.task, list(rate.by_training_seed)) for rate in found.rates if rate.policy == "a"] == [
         ("mug", [0, 1]),
         ("handover_block", [0]),
     ]
     assert [contest.task for contest in found.contests] == ["handover_block"]
+
+
+def test_files_of_one_checkpoint_are_of_one_training_seed():
+    parts = {
+        execution: evaluation("a", [1, 0], training_seed=None, checkpoint="abc", execution=execution)
+        for execution in ("25", "aggregate")
+    }
+    rates = build_report(list(parts.values())).rates
+    assert [list(rate.by_training_seed) for rate in rates] == [[0], [0]]
+    again = evaluation("a", [1, 0], training_seed=None, checkpoint="abc", execution="25")
+    with pytest.raises(DataError, match="one results file"):  # not a second training
+        build_report([*parts.values(), again])
 
 
 def test_crashed_episodes_are_failures_and_said():

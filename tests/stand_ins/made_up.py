@@ -20,9 +20,10 @@ def episodes(outcomes, *, first_seed=100_000, **more):
     return [episode(first_seed + i, success, **more) for i, success in enumerate(outcomes)]
 
 
-def evaluation(policy, outcomes, *, training_seed=0, task="click_alarmclock", execution="aggregate"):
+def evaluation(policy, outcomes, *, training_seed=0, task="click_alarmclock", execution="aggregate", checkpoint=None):
     """One evaluation of a checkpoint, with the outcome of each seed."""
-    results = episodes(outcomes, task=task, execution=execution, checkpoint=f"{policy}{training_seed}")
+    checkpoint = checkpoint or f"{policy}{training_seed}"
+    results = episodes(outcomes, task=task, execution=execution, checkpoint=checkpoint)
     return Evaluation(policy, training_seed, Path(f"{policy}-{task}-{training_seed}.jsonl"), results)
 
 

@@ -152,13 +152,16 @@ def build_report(evaluations: Sequence[Evaluation], *, baseline: str | None = No
 
 
 def _numbered(evaluations: Sequence[Evaluation], remarks: list[str]) -> list[Evaluation]:
-    """Give evaluations of unknown training seed a number of their own: the first that their tasks have not had."""
+    """Give checkpoints of unknown training seed a number of their own: the first that their tasks have not had."""
     numbered, unknown = [], dict[str, dict[str, int]]()
+    known: dict[tuple[str, str | None], int] = {}  # by policy and checkpoint
     for item in evaluations:
         if item.training_seed is None:
             had, tasks = unknown.setdefault(item.policy, {}), {episode.task for episode in item.results}
             number = max((had.get(task, 0) for task in tasks), default=0)
-            had |= dict.fromkeys(tasks, number + 1)
+            for sha in {episode.checkpoint for episode in item.results} - {None}:
+                number = known.setdefault((item.policy, sha), number)
+            had |= {task: max(had.get(task, 0), number + 1) for task in tasks}
             numbered.append(replace(item, training_seed=number))
         else:
             numbered.append(item)
