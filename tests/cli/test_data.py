@@ -66,7 +66,7 @@ def test_converting_writes_says_what_was_lost_and_goes_on(folder, capsys):
         assert main(["data", "convert", str(folder), "out", "--to", "act"]) == 0
         told = capsys.readouterr()
         assert "out: 5 episodes, 60 steps as act; states and actions are the same to the bit" in told.out
-        assert "left out    contacts, measured, phase, slack" in told.out
+        assert "left out    contacts, endpose, measured, phase, projection, slack" in told.out
         assert "checking: 5/5" in told.err
     assert main(["data", "inspect", "out"]) == 0
     assert "no policy with `keyframes` learns from them; missing: tool poses (`endpose`)" in capsys.readouterr().out
