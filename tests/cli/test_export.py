@@ -23,7 +23,12 @@ needs_onnx = pytest.mark.skipif(
     reason="the extra `onnx` is not installed",
 )
 TINY = {"dim": 16, "feedforward": 24, "heads": 2, "encoder_layers": 1, "cvae_layers": 1, "latent_dim": 2}
-DATA = {"task": "click_alarmclock", "setting": "demo_clean", "image_size": (32, 64), "split": {"train": [0, 2]}}
+DATA = {
+    "task": "click_alarmclock",
+    "setting": "demo_clean",
+    "image_size": (32, 64),
+    "split": {"split_seed": 3, "train": [0, 2]},
+}
 
 
 def save(policy: ChunkPolicy, name: str = "policy.ckpt") -> ChunkPolicy:
@@ -68,7 +73,7 @@ def test_a_folder_of_safetensors_is_the_same_policy(refined, capsys):
     again, info = load_policy("folder")
     seen = look(refined)
     assert torch.equal(again.predict(seen).actions, refined.predict(seen).actions)
-    assert info.data["split"] == {"train": [0, 2]}
+    assert info.data["split"] == {"split_seed": 3, "train": [0, 2]}
     assert main(["inspect", "folder"]) == 0
     assert "unshuffle" in capsys.readouterr().out
     assert main(["export", "folder", "--to", "safetensors", "--out", "copy"]) == 0
