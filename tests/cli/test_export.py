@@ -127,6 +127,7 @@ def test_the_card_says_what_it_is_and_how_well_it_does(refined):
         "license: mit",
         "click_alarmclock",
         "- train episodes: 2: 0, 2",
+        "- split seed: 3\n",
         "3/4 = 75.0%",
         "[30.1%",
         sha,

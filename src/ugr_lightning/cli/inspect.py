@@ -93,7 +93,7 @@ def _runs(folder: Path) -> list[str]:
         try:
             said = f"step {read_checkpoint(path, mmap=True).get('global_step')}"
         except CheckpointError as error:
-            said = f"damaged, {error.got}"
+            said = f"cannot be read ({error.got})"
         lines.append(f"{path}: {said}, {path.stat().st_size / 2**20:.1f} MiB")
     if not lines:
         from ugr_lightning.data.formats import detect
