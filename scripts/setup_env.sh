@@ -70,7 +70,7 @@ pip=("$VENV/bin/python" -m pip --disable-pip-version-check)
 index=$(torch_index "$python")
 torch=$(grep '^torch==' requirements.lock)
 
-say "installing $(grep -c '==' requirements.lock) pinned packages (2.3 GB on disk with a CPU-only torch); nothing outside $VENV is touched"
+say "installing $(grep -c '==' requirements.lock) pinned packages (3.7 GB on disk with a CPU-only torch); nothing outside $VENV is touched"
 failed="Packages could not be installed; pip's message above says which. With a slow or filtered network, run the same command again: what is there already is kept."
 # torch first and with its dependencies, because its CUDA build needs libraries that its CPU build does not; the lock bounds the rest.
 "${pip[@]}" install -q --constraint requirements.lock ${index:+--extra-index-url "$index"} "$torch" || stop "$failed"
