@@ -82,6 +82,16 @@ def test_wide_films_are_halved_as_gif_and_still_say_the_step(tmp_path):
         assert np.asarray(gif.convert("RGB"))[60, 0, 1] > 150
 
 
+def test_the_frame_of_a_success_is_green_in_a_gif_whose_other_pictures_have_no_green(tmp_path):
+    shades = np.random.default_rng(0).integers(90, 200, (40, 3, 60, 80, 1), dtype=np.uint8)
+    pictures = list(np.repeat(shades, 3, axis=-1))
+    write_video(tmp_path / "a.gif", compose_frames(pictures, success=[False] * 38 + [True] * 2))
+    with Image.open(tmp_path / "a.gif") as gif:
+        gif.seek(39)
+        red, green, blue = np.asarray(gif.convert("RGB"))[30, 0].astype(int)
+    assert green > 1.5 * max(red, blue)
+
+
 def test_mp4_plays_even_with_odd_sizes(tmp_path):
     write_video(tmp_path / "a.mp4", compose_frames(images()), fps=25)
     reader = imageio_ffmpeg.read_frames(str(tmp_path / "a.mp4"))

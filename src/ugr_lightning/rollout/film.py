@@ -149,7 +149,7 @@ def _write_gif(path: Path, frames: Sequence[np.ndarray] | np.ndarray, fps: float
     """One palette for all frames: Pillow then stores only what changes, a third of the size; wide ones are shrunk."""
     shrink = -(-frames[0].shape[1] // GIF_WIDTH)
     frames = [frame[::shrink, ::shrink] for frame in frames]
-    sample = np.concatenate(list(frames[:: max(1, len(frames) // 4)]))
+    sample = np.concatenate([*frames[:: max(1, len(frames) // 4)], frames[-1]])  # the last has the colour of a success
     palette = Image.fromarray(sample).quantize(128, dither=Image.Dither.NONE)
     pictures = [Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames]
     duration = max(20, round(1000 / fps / 10) * 10)  # GIF counts in hundredths of a second
