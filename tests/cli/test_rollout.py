@@ -174,6 +174,18 @@ def test_a_test_that_goes_on_runs_only_the_missing_episodes(world, tiny_config, 
     assert "/5" in capsys.readouterr().out
 
 
+def test_a_rollout_that_goes_on_runs_only_the_missing_episodes_of_a_file_that_it_is_told(world, tmp_path, capsys):
+    out = tmp_path / "results.jsonl"
+    command = ["rollout", "--policy", "zero", "--task", "click_alarmclock", "--seeds", "selection"]
+    assert main([*command, "--episodes", "2", "--out", str(out)]) == 0
+    assert main([*command, "--episodes", "3", "--out", str(out), "--resume"]) == 0
+    assert [call["seeds"] for call in world] == [[200000, 200001], [200002]]
+    assert [result.seed for result in read_results(out)] == [200000, 200001, 200002]
+    capsys.readouterr()
+    assert main([*command, "--episodes", "3", "--resume"]) == 2
+    assert "--resume: expected the results file of the start before" in " ".join(capsys.readouterr().err.split())
+
+
 def test_rollout_hands_the_setting_on_and_clean_is_the_default(world):
     command = ["rollout", "--policy", "zero", "--task", "click_alarmclock", "--episodes", "1"]
     assert main([*command, "--setting", "demo_randomized"]) == 0

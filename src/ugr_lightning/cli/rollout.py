@@ -37,6 +37,7 @@ def _rollout(
     traces: str | None = None,
     refine_ratio: float | None = None,
     device: str = "auto",
+    resume: bool = False,
     shard: str | None = None,
 ) -> int:
     """Let a policy act in a task and count its successes.
@@ -60,6 +61,7 @@ def _rollout(
         traces: folder for what was predicted in each episode, one `.npz` file each.
         refine_ratio: share of each chunk that is refined, 0 to 1, in place of the one in training.
         device: where the policy computes: `auto` is the GPU where there is one; or `cpu`, `cuda:1`.
+        resume: run only the episodes that the results file lacks.
         shard: `3/8` is the third of eight processes that share the episodes and the results file; it runs what the file
             lacks of its part. `1/1` runs what is missing afterwards, and sums up all.
     """
@@ -79,6 +81,8 @@ def _rollout(
     if shard is not None and out is None:
         fix = "Give all of them the same `--out FILE`."
         raise ConfigError("--shard", "a results file that the shards share", "none", fix)
+    if resume and out is None:
+        raise ConfigError("--resume", "the results file of the start before", "none", "Give its `--out FILE`.")
     part = every_nth(shard)
     loaded = None if checkpoint is None else load_policy(resolve_checkpoint(checkpoint, run, root))
     spec = evaluation_spec(
@@ -92,7 +96,7 @@ def _rollout(
         workers=workers,
         out=Path(out) if out else None,
         traces=Path(traces) if traces else None,
-        resume=shard is not None,
+        resume=resume or shard is not None,
     )
     if video:
         spec = replace(spec, videos={spec.seeds[0]: Path(video)})

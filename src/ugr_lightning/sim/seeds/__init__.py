@@ -47,7 +47,7 @@ def seeds_hash(seeds: Sequence[int]) -> str:
 
 
 def seed_list(which: SeedChoice, task: str, count: int) -> tuple[list[int], list[int]]:
-    """The seeds of some episodes, and the whole list they are from.
+    """The seeds of some episodes, and the list they are from: one without an end is told by its first.
 
     Args:
         which: name of a list, or the first seed.
@@ -66,5 +66,4 @@ def seed_list(which: SeedChoice, task: str, count: int) -> tuple[list[int], list
             raise ConfigError("--episodes", f"at most the {len(whole)} evaluation seeds", count, fix)
         return whole[:count], whole
     first = SELECTION_START if which == "selection" else int(which)
-    seeds = list(range(first, first + count))
-    return seeds, seeds
+    return list(range(first, first + count)), [first]  # else more of them would be another list
