@@ -116,6 +116,37 @@ def test_what_is_impossible_is_said_before_any_episode(command, world, options, 
     assert world == []
 
 
+def test_a_teacher_takes_over_steps_that_each_rule_chooses(command, world, tiny_act, untrained, tmp_path, capsys):
+    teacher = untrained(tiny_act(), tmp_path / "teacher")
+    world.succeeds = lambda seed, actor, execution: "first" in actor.name or "100%" in actor.name
+    assert main([*command, "--teacher", str(teacher), "--executions", "[5]"]) == 0
+    asked = [(call["actor"].partition(":")[0], call["execution"], len(call["seeds"])) for call in world]
+    shares = [f"{share}, {rule}" for share in ("30%", "50%") for rule in ("least certain", "scattered", "first")]
+    assert asked == [("ACT(refine_ratio=0)", 5, 10), *((f"ACT({share}", 5, 10) for share in [*shares, "100%"])]
+    folder = tmp_path / "ceiling-policy_best"
+    assert "| 30%, first | 3 | 10/10 = 100.0%" in (folder / "sweep.md").read_text()
+    found = json.loads((folder / "sweep.json").read_text())
+    assert found["teacher"]["file"] == str(teacher)
+    assert [use["successes"] for use in found["budgets"]["uses"]] == [0, 0, 0, 10, 0, 0, 10, 10]
+    assert "with 0%, coarse policy" in capsys.readouterr().out
+    world.clear()
+    assert main([*command, "--teacher", str(teacher), "--executions", "[5]"]) == 0
+    assert world == [], "it goes on where it was stopped"
+
+
+def test_a_teacher_of_another_kind_is_refused_before_any_episode(command, world, tiny_act, untrained, tmp_path, capsys):
+    for teacher, says in (
+        (untrained(tiny_act(chunk_length=5), tmp_path / "short"), "teacher.chunk_length: expected that of the student"),
+        (save(tiny_act(), tmp_path / "fine.ckpt", image_size=(60, 80)), "--teacher, its image_size"),
+        (tmp_path / "nowhere.ckpt", "nowhere.ckpt"),
+    ):
+        assert main([*command, "--teacher", str(teacher)]) == 2
+        assert says in " ".join(capsys.readouterr().err.split())
+    assert main([*command[:-2], "--ratios", "[]", "--teacher", str(teacher)]) == 2
+    assert "--ratios: expected shares" in " ".join(capsys.readouterr().err.split())
+    assert world == []
+
+
 def test_two_sweeps_cannot_write_one_folder(command, world, tmp_path, capsys):
     with locked(tmp_path / "sweep-policy_best" / "sweep.lock", "test"):
         assert main([*command, "--data", "null"]) == 2
