@@ -27,8 +27,8 @@ def fit(config, *options):
     assert main(["fit", "--config", config, *options]) == 0
 
 
-def weights(folder):
-    return torch.load(folder / "last.ckpt", weights_only=True)["state_dict"]
+def weights(folder, file="last.ckpt"):
+    return torch.load(folder / file, weights_only=True)["state_dict"]
 
 
 def scores(folder):
@@ -398,6 +398,7 @@ def test_the_home_folder_is_understood_however_a_path_is_given(tiny_config, tmp_
 WHERE = {
     "step": "tiny.TinyPolicy.losses",
     "validation": "ugr_lightning.training.module.PolicyModule.validation_step",
+    "figures": "ugr_lightning.training.callbacks.figures.ValidationFigures.on_validation_end",
     "loading": "ugr_lightning.data.chunks.ChunkDataset.__getitems__",
 }
 
@@ -408,7 +409,7 @@ def test_a_signal_ends_with_its_code_and_leaves_a_checkpoint_that_goes_on_exactl
     tiny_config, monkeypatch, capsys, where, name
 ):
     signal.signal(signal.SIGHUP, signal.SIG_DFL)  # also under `nohup`
-    whole = ["--model.schedule", "constant"]
+    whole = ["--model.schedule", "constant", "--checkpoints.mode", "max"]  # the first validation's is the best
     fit(tiny_config, *whole, "--run", "straight")
     path, _, method = WHERE[where].rpartition(".")
     module, _, owner = path.rpartition(".")
@@ -417,7 +418,7 @@ def test_a_signal_ends_with_its_code_and_leaves_a_checkpoint_that_goes_on_exactl
 
     def interrupted(self, *arguments):
         calls.append(1)
-        if len(calls) == (1 if where == "validation" else 2):
+        if len(calls) == (1 if where in ("validation", "figures") else 2):
             os.kill(os.getpid(), getattr(signal, name))
         return original(self, *arguments)
 
@@ -426,10 +427,37 @@ def test_a_signal_ends_with_its_code_and_leaves_a_checkpoint_that_goes_on_exactl
         assert main(["fit", "--config", tiny_config, *whole]) == 128 + getattr(signal, name)
     assert f"interrupted by {name} after step" in capsys.readouterr().err
     reached = torch.load(RUN / "last.ckpt", weights_only=True)["global_step"]
-    assert reached == {"step": 2, "validation": 3, "loading": 1}[where]
+    assert reached == {"step": 2, "validation": 3, "figures": 3, "loading": 1}[where]
     fit(tiny_config, *whole, "--checkpoint", "last")
-    a, b = weights(RUN), weights(Path("runs/straight/version_0"))
-    assert all(torch.equal(a[key], b[key]) for key in a)
+    straight = Path("runs/straight/version_0")
+    for file in ("last.ckpt", "policy_best.ckpt", "policy_best_loss.ckpt"):
+        a, b = weights(RUN, file), weights(straight, file)
+        assert all(torch.equal(a[key], b[key]) for key in a), file
+    a, b = ([row["val/loss"] for row in scores(folder) if row["val/loss"]] for folder in (RUN, straight))
+    assert a == b
+
+
+@pytest.mark.parametrize("times", [1, 2])
+def test_a_signal_in_the_last_validation_keeps_what_it_finds_unless_it_comes_twice(
+    tiny_config, monkeypatch, capfd, times
+):
+    from ugr_lightning.training.module import PolicyModule
+
+    original = PolicyModule.validation_step
+
+    def interrupted(self, *arguments):
+        if self.global_step == 6:
+            for _ in range(times):
+                os.kill(os.getpid(), signal.SIGTERM)
+        return original(self, *arguments)
+
+    monkeypatch.setattr(PolicyModule, "validation_step", interrupted)
+    assert main(["fit", "--config", tiny_config]) == 128 + signal.SIGTERM
+    said = capfd.readouterr().err
+    assert "Stops when this validation is written" in said
+    assert ("interrupted by SIGTERM after the last step" in said) == (times == 1)
+    assert torch.load(RUN / "last.ckpt", weights_only=True)["global_step"] == 6
+    assert len([row for row in scores(RUN) if row["val/loss"]]) == (2 if times == 1 else 1)
 
 
 def test_an_interrupt_in_the_middle_of_a_step_leaves_the_checkpoint_before(tiny_config, monkeypatch):

@@ -29,6 +29,7 @@ from ugr_lightning.models.checkpoint import read_checkpoint
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.limits import usable_cores
 from ugr_lightning.system.lock import locked
+from ugr_lightning.system.signals import Stopped
 from ugr_lightning.training.callbacks.averaging import WeightAverage
 from ugr_lightning.training.callbacks.checkpoints import PolicyCheckpoints
 from ugr_lightning.training.callbacks.figures import ValidationFigures
@@ -241,6 +242,9 @@ class UGRCLI(LightningCLI):
         folder = self.trainer.log_dir  # asked in every process: the first one tells the others
         if _is_first_process():
             print(f"trained to step {self.trainer.global_step}: {folder}")
+        asked = next(item.asked for item in self.trainer.callbacks if isinstance(item, OrderlyStop))  # type: ignore[attr-defined]
+        if asked is not None:
+            raise Stopped(asked, "after the last step")
 
     def validate(self, **given: Any) -> None:
         """Validate; Lightning calls it in place of the trainer's."""
