@@ -1,4 +1,5 @@
 import json
+import signal
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.checkpoint import load_policy
 from ugr_lightning.results.results import read_results
 from ugr_lightning.sim.seeds import seed_list
+from ugr_lightning.system.signals import Stopped
 
 
 def test_rollout_prints_rate_and_interval_and_writes_a_line_per_episode(world, tmp_path, capsys):
@@ -245,3 +247,29 @@ def test_shards_of_a_rollout_need_a_file_that_they_share(world, capsys):
     assert main(["rollout", "--policy", "zero", "--task", "click_alarmclock", "--shard", "1/2"]) == 2
     assert "--out FILE" in capsys.readouterr().err
     assert world == []
+
+
+def test_a_rollout_on_other_pictures_or_on_the_scenes_of_the_training_says_so(world, checkpoint, recwarn, capsys):
+    command = ["rollout", str(checkpoint), "--episodes", "1"]
+    assert main(command) == 0
+    assert main(["rollout", "--task", "click_alarmclock", "--episodes", "1", "--seeds", "3"]) == 0
+    assert not list(recwarn), "the expert was shown nothing"
+    with pytest.warns(UserWarning, match="trained on pictures of .*, not 60x80"):
+        assert main([*command, "--image_size", "[60, 80]"]) == 0
+    with pytest.warns(UserWarning, match="Seeds below 100000 are those of demonstrations"):
+        assert main([*command, "--seeds", "3"]) == 0
+    world.clear()
+    assert main([*command, "--seeds", "-5"]) == 2
+    assert "--seeds: expected a first seed of 0 or more" in " ".join(capsys.readouterr().err.split())
+    assert world == []
+
+
+def test_an_interrupted_test_says_how_the_other_episodes_are_run(world, checkpoint, monkeypatch, capsys):
+    def stopped(*arguments, **options):
+        raise Stopped(signal.SIGTERM)
+
+    monkeypatch.setattr("ugr_lightning.rollout.evaluate.run_episodes", stopped)
+    assert main(["test", str(checkpoint)]) == 143
+    assert "interrupted by SIGTERM (`--resume` runs the other episodes)" in capsys.readouterr().err
+    assert main(["rollout", str(checkpoint)]) == 143
+    assert capsys.readouterr().err.strip().endswith("interrupted by SIGTERM"), "no file that could go on"

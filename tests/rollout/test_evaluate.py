@@ -11,6 +11,7 @@ from fake_simulator import HOME, FakeSimulator
 
 from ugr_lightning.contract import CAMERAS, Observation
 from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.results.results import read_results
 from ugr_lightning.rollout.actors import ROWS, Actor, Decision, PolicyActor
 from ugr_lightning.rollout.aggregation import make_execution
 from ugr_lightning.rollout.evaluate import make_actor, run_episodes
@@ -392,6 +393,13 @@ def test_an_unknown_actor_or_execution_is_an_error(runner):
 
 def test_results_say_the_setting_that_the_episodes_ran_in():
     assert [result.setting for result in run("zero", [1, 2], setting="demo_randomized")] == ["demo_randomized"] * 2
+
+
+def test_episodes_of_other_pictures_are_other_episodes(tmp_path):
+    out = tmp_path / "results.jsonl"
+    for size in ((24, 32), (24, 32), (12, 16)):
+        run(PolicyActor(Reacher()), [1], out=out, resume=True, image_size=size)
+    assert [result.image_size for result in read_results(out)] == [[24, 32], [12, 16]]
 
 
 def test_a_video_of_an_unknown_kind_and_nothing_to_run_are_refused_at_once(tmp_path):

@@ -1,19 +1,23 @@
 """`ugr rollout` and `ugr test`: let a policy act and count its successes."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from ugr_lightning.cli.parsing.call import call
 from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.errors import ConfigError, SimulationError
+from ugr_lightning.system.signals import Stopped
 from ugr_lightning.training.runs import FILES, or_best, resolve_checkpoint
 
 if TYPE_CHECKING:
     from ugr_lightning.contract import ChunkPolicy
     from ugr_lightning.results.results import EpisodeResult
     from ugr_lightning.rollout.actors import Actor
+    from ugr_lightning.rollout.spec import RolloutSpec
 
 ExecutionName = Literal["aggregate", "aggregate-variance"] | int
 EXECUTED_STEPS = 25
@@ -106,10 +110,38 @@ def _rollout(
     actor = (
         checkpoint_actor(*loaded, spec.task, refine_ratio=refine_ratio, device=device) if loaded else policy or "expert"
     )
-    results = run_episodes(actor, mine)
+    if loaded:
+        _warn_of_other_conditions(mine, loaded[1].data)
+    with _noting(mine.out):
+        results = run_episodes(actor, mine)
     if video and results[0].seed in spec.videos:
         print(f"video: {results[0].video or 'none: its episode was in the results file already, or has crashed'}")
     return _tell(results, actor)
+
+
+@contextmanager
+def _noting(out: Path | None) -> Iterator[None]:
+    """Say, where episodes are kept and a signal ends their run, how the rest of them is run."""
+    try:
+        yield
+    except Stopped as stop:
+        stop.note = "" if out is None else "(`--resume` runs the other episodes)"
+        raise
+
+
+def _warn_of_other_conditions(spec: "RolloutSpec", data: Mapping[str, Any]) -> None:
+    """A policy that sees other pictures than in training, or the scenes of its training."""
+    from ugr_lightning.sim.seeds import EVALUATION_START
+
+    if (size := data.get("image_size")) and tuple(size) != spec.image_size:
+        seen = "x".join(map(str, spec.image_size))
+        warnings.warn(f"The policy was trained on pictures of {size[0]}x{size[1]}, not {seen}.", stacklevel=2)
+    if spec.seeds[0] < EVALUATION_START:
+        warnings.warn(
+            f"Seeds below {EVALUATION_START} are those of demonstrations: success on scenes that a policy was shown "
+            "says nothing about new ones. Leave `--seeds` out, or give `selection`.",
+            stacklevel=2,
+        )
 
 
 def _test(
@@ -170,7 +202,7 @@ def _test(
         return 0
     actor = checkpoint_actor(policy, info, spec.task, refine_ratio=refine_ratio, device=device)
     results = []
-    with Simulators() as simulators:
+    with Simulators() as simulators, _noting(spec.out):
         for execution in executions or both_executions(policy):
             results += run_episodes(actor, replace(mine, execution=execution), simulators=simulators)
     print(f"episodes: {spec.out}")

@@ -195,7 +195,8 @@ def _check_seed_lists(found: dict[tuple[Mode, str], dict[str, dict[int, list[Epi
         hashes = {item.seeds_hash for seeds in policies.values() for part in seeds.values() for item in part}
         if len(hashes) > 1:
             got = ", ".join(sorted(text[:12] for text in hashes))
-            fix = "The task's seed list has changed between them; evaluate again with one version of the package."
+            fix = "Give results of the evaluation seeds alone, or of the same others. If all are of the evaluation "
+            fix += "seeds, that list has changed: evaluate again with one version of the package."
             raise DataError(f"results of {task}", "episodes from one list of seeds", f"the hashes {got}", fix)
 
 

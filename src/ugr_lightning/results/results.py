@@ -47,6 +47,8 @@ class EpisodeResult:
             actor without chunks and in files from before this field.
         alarm: control step of the first alarm; None where none was raised.
         alarm_rate: share of successes, at most, in which the alarm is raised that watched; None where none did.
+        image_size: height and width of the pictures that were looked at; None where nobody looked, and in files from
+            before this field.
     """
 
     task: str
@@ -69,6 +71,7 @@ class EpisodeResult:
     disagreement: float | None = None
     alarm: int | None = None
     alarm_rate: float | None = None
+    image_size: list[int] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain containers, ready for JSON."""

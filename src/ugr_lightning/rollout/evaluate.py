@@ -221,6 +221,7 @@ def _result(episode: RunningEpisode, crash: str | None, actor: Actor, spec: Roll
         disagreement=episode.trace.disagreement,
         alarm=episode.trace.alarm,
         alarm_rate=None if actor.alarm is None else actor.alarm.rate,
+        image_size=list(spec.image_size) if actor.cameras else None,
     )
 
 
@@ -235,7 +236,7 @@ def _write(result: EpisodeResult, episode: RunningEpisode, spec: RolloutSpec) ->
 
 
 def _finished(spec: RolloutSpec, actor: Actor) -> dict[int, EpisodeResult]:
-    """The episodes that the results file has already, by seed: of this task, seed list, policy and execution."""
+    """The episodes that the results file has already, by seed: of this task, seed list, policy, execution and size."""
     assert spec.out is not None
     drop_cut_off_line(spec.out)
     stamp = (spec.task, spec.setting, spec.seeds_hash or seeds_hash(spec.seeds))
@@ -244,4 +245,5 @@ def _finished(spec: RolloutSpec, actor: Actor) -> dict[int, EpisodeResult]:
         item.seed: item
         for item in (read_results(spec.out) if spec.out.is_file() else [])
         if (item.task, item.setting, item.seeds_hash, item.policy, item.checkpoint, item.execution) == stamp
+        and (item.image_size is None or item.image_size == list(spec.image_size))
     }

@@ -20,7 +20,9 @@ AT_ONCE = 16
 
 
 class Predictions(NamedTuple):
-    """Errors and uncertainties of n chunks, in standard deviations of the training actions; NaN on padded steps.
+    """Errors, as lengths over all joints, and uncertainties of n chunks; NaN on padded steps.
+
+    The unit is the standard deviation of the training actions.
 
     Args:
         coarse: (n, K) length of the error of the coarse action, the one that the uncertainty head learns.

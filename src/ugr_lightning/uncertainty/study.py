@@ -128,7 +128,7 @@ def begin_study(
         study.content["mean error"] = dict(zip(("training", "validation"), errors, strict=True))
         study.sentences.append(
             f"The policy predicts no s_k (`uncertainty_head: true` trains one). Its mean error is {errors[0]:.3g} on "
-            f"training and {errors[1]:.3g} on validation episodes, in standard deviations of an action."
+            f"training and {errors[1]:.3g} on validation episodes, length over all joints, in standard deviations."
         )
     else:
         _add_calibration(study)

@@ -62,8 +62,10 @@ def seed_list(which: SeedChoice, task: str, count: int) -> tuple[list[int], list
     if which == "evaluation":
         whole = evaluation_seeds(task)
         if count > len(whole):
-            fix = "Give the first seed of another range instead, e.g. --seeds 300000."
+            fix = f"Make a longer list with `ugr tasks seeds {task}`, or let `ugr rollout --seeds 300000` take others."
             raise ConfigError("--episodes", f"at most the {len(whole)} evaluation seeds", count, fix)
         return whole[:count], whole
     first = SELECTION_START if which == "selection" else int(which)
+    if first < 0:
+        raise ConfigError("--seeds", "a first seed of 0 or more", first, "Selection seeds begin at 200000.")
     return list(range(first, first + count)), [first]  # else more of them would be another list
