@@ -1,5 +1,6 @@
 import csv
 import importlib.util
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -458,6 +459,23 @@ def test_a_signal_in_the_last_validation_keeps_what_it_finds_unless_it_comes_twi
     assert ("interrupted by SIGTERM after the last step" in said) == (times == 1)
     assert torch.load(RUN / "last.ckpt", weights_only=True)["global_step"] == 6
     assert len([row for row in scores(RUN) if row["val/loss"]]) == (2 if times == 1 else 1)
+
+
+def test_a_signal_to_the_loaders_too_as_a_terminal_sends_it_loses_nothing(tiny_config, monkeypatch, capfd):
+    from ugr_lightning.training.module import PolicyModule
+
+    original = PolicyModule.validation_step
+
+    def interrupted(self, *arguments):
+        for process in [*multiprocessing.active_children(), multiprocessing.current_process()]:
+            os.kill(process.pid, signal.SIGINT)
+        return original(self, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(PolicyModule, "validation_step", interrupted)
+        assert main(["fit", "--config", tiny_config, "--data.num_workers", "1"]) == 130
+    assert "interrupted by SIGINT after step 3; `--checkpoint last` goes on" in capfd.readouterr().err
+    assert torch.load(RUN / "policy_best.ckpt", weights_only=True)["global_step"] == 3
 
 
 def test_an_interrupt_in_the_middle_of_a_step_leaves_the_checkpoint_before(tiny_config, monkeypatch):

@@ -2,12 +2,14 @@
 
 import json
 
+import deployed
 import numpy as np
 import pytest
 from deployed import looking_act, save
 from PIL import Image
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.models.refine.head import Head
 from ugr_lightning.results.results import read_results
 from ugr_lightning.system.lock import locked
 
@@ -121,13 +123,13 @@ def test_a_teacher_takes_over_steps_that_each_rule_chooses(command, world, tiny_
     world.succeeds = lambda seed, actor, execution: "first" in actor.name or "100%" in actor.name
     assert main([*command, "--teacher", str(teacher), "--executions", "[5]"]) == 0
     asked = [(call["actor"].partition(":")[0], call["execution"], len(call["seeds"])) for call in world]
-    shares = [f"{share}, {rule}" for share in ("30%", "50%") for rule in ("least certain", "scattered", "first")]
+    shares = [f"50%, {rule}" for rule in ("least certain", "scattered", "first")]
     assert asked == [("ACT(refine_ratio=0)", 5, 10), *((f"ACT({share}", 5, 10) for share in [*shares, "100%"])]
     folder = tmp_path / "ceiling-policy_best"
-    assert "| 30%, first | 3 | 10/10 = 100.0%" in (folder / "sweep.md").read_text()
+    assert "| 50%, first | 5 | 10/10 = 100.0%" in (folder / "sweep.md").read_text()
     found = json.loads((folder / "sweep.json").read_text())
     assert found["teacher"]["file"] == str(teacher)
-    assert [use["successes"] for use in found["budgets"]["uses"]] == [0, 0, 0, 10, 0, 0, 10, 10]
+    assert [use["successes"] for use in found["budgets"]["uses"]] == [0, 0, 0, 10, 10]
     assert "with 0%, coarse policy" in capsys.readouterr().out
     world.clear()
     assert main([*command, "--teacher", str(teacher), "--executions", "[5]"]) == 0
@@ -142,8 +144,12 @@ def test_a_teacher_of_another_kind_is_refused_before_any_episode(command, world,
     ):
         assert main([*command, "--teacher", str(teacher)]) == 2
         assert says in " ".join(capsys.readouterr().err.split())
-    assert main([*command[:-2], "--ratios", "[]", "--teacher", str(teacher)]) == 2
-    assert "--ratios: expected shares" in " ".join(capsys.readouterr().err.split())
+    for ratios, says in (("[]", "--ratios: expected shares"), ("[0.01]", "at least one of 10 steps")):
+        assert main([*command[:-2], "--ratios", ratios, "--teacher", str(teacher)]) == 2
+        assert says in " ".join(capsys.readouterr().err.split())
+    unsure = save(deployed.tiny_act(refine=Head()), tmp_path / "unsure.ckpt")
+    assert main(["sweep", str(unsure), "--teacher", str(unsure)]) == 2
+    assert "--teacher: expected a student with a log-variance" in " ".join(capsys.readouterr().err.split())
     assert world == []
 
 

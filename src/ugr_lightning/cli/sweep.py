@@ -45,8 +45,8 @@ def _sweep(
         root: folder of all runs.
         seeds: `selection` (a budget may be chosen by them), `evaluation` (only to report), or the first seed.
         episodes: how many of those seeds, for each budget and for each execution.
-        ratios: budgets as shares of the chunk; 0 and the one of the training are added; null means tenths from 0 to 1,
-            `[]` leaves budgets out, for policies that do not rank steps.
+        ratios: budgets as shares of the chunk; 0 and the one of the training are added, with a teacher 0 and 1; null
+            means tenths from 0 to 1, `[]` leaves budgets out, for policies that do not rank steps.
         executions: each `aggregate`, `aggregate-variance`, or the number of steps executed of each chunk;
             budgets are compared in the first, the others with it. Null means all that the policy can, 25 steps of them.
         teacher: checkpoint file of a better policy, whose actions then take the place of those that would be refined,
@@ -148,20 +148,26 @@ def _plan(
         fix = "Leave it out, or train with `uncertainty_head: true`."
         raise ConfigError(f"--executions {VARIANCE}", "a policy with a log-variance per step", "one without", fix)
     tried = sorted({0.0, trained, *wanted}) if wanted else []
+    if teacher is not None and not certain:
+        fix = "Take a student that was trained with `uncertainty_head: true`."
+        raise ConfigError("--teacher", "a student with a log-variance per step", "one without", fix)
     if teacher is not None:
-        return SweepPlan(checkpoint, policy, info, _ceilings(tried, chosen[0]), [], _taught_by(teacher, policy, info))
+        trials = _ceilings(sorted(set(wanted)), policy.chunk_length, chosen[0])
+        return SweepPlan(checkpoint, policy, info, trials, [], _taught_by(teacher, policy, info))
     budgets = [Trial(budget_name(r, trained), chosen[0], None if r == trained else r) for r in tried]
     return SweepPlan(checkpoint, policy, info, budgets, [Trial(execution_name(how), how) for how in chosen])
 
 
-def _ceilings(ratios: list[float], execution: ExecutionName) -> list[Trial]:
+def _ceilings(ratios: list[float], chunk_length: int, execution: ExecutionName) -> list[Trial]:
     """Nothing, each share chosen by each rule, and everything."""
     from ugr_lightning.uncertainty.closed_loop import budget_name
     from ugr_lightning.uncertainty.taught import RULES
 
-    if not ratios:
+    if not any(ratios):
         raise ConfigError("--ratios", "shares for the teacher to take over", "none", "Give some, e.g. `[0.3]`.")
-    some = [Trial(f"{r:.0%}, {rule}", execution, r, rule) for r in ratios if 0 < r < 1 for rule in RULES]
+    for share in filter(None, ratios):
+        RULES["first"](share).budget(chunk_length)
+    some = [Trial(f"{100 * r:g}%, {rule}", execution, r, rule) for r in ratios if 0 < r < 1 for rule in RULES]
     return [Trial(budget_name(0, None), execution, 0.0), *some, Trial("100%", execution, 1.0, "first")]
 
 

@@ -24,6 +24,7 @@ from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.data.storage.cache import Cache, open_frames
 from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.system.progress import Progress
+from ugr_lightning.system.signals import deaf_to_signals
 
 MANY = 200
 """Demonstrations; reading and checking so many takes seconds, and how far it is gets shown."""
@@ -275,6 +276,7 @@ class ChunkDataModule(lightning.LightningDataModule):
             "persistent_workers": self.num_workers > 0,
             "pin_memory": torch.cuda.is_available(),
             "collate_fn": _as_it_is,
+            "worker_init_fn": deaf_to_signals,
         }
         if trainer is not None and trainer.overfit_batches > 0:
             # Lightning replaces every sampler of ours then, by one that goes through single frames in order.

@@ -66,3 +66,9 @@ def handled(handler: Any) -> Iterator[None]:
     finally:
         for number, previous in before.items():
             signal.signal(number, signal.SIG_DFL if previous is None else previous)
+
+
+def deaf_to_signals(worker: int = 0) -> None:
+    """Leave the signals of a terminal or a cluster to the process that started this one, and ends it in its time."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)

@@ -95,13 +95,14 @@ def resolve_checkpoint(which: str, run: str | None, root: str | Path) -> Path:
     others = [name for name, file in FILES.items() if any((place / file).is_file() for place in candidates)]
     if others:
         raise CheckpointError(where, expected, f"only {', '.join(others)}", f"Use --checkpoint {others[-1]}.")
-    if folder.is_dir():
+    if folder.is_dir() and not any(folder.rglob("*.ckpt")):
         fix = "Nothing of it is saved: train it anew, without --checkpoint."
         raise CheckpointError(where, expected, f"none in {folder}", fix)
     names = sorted(path.name for path in root.iterdir() if path.is_dir()) if root.is_dir() else []
     near = difflib.get_close_matches(run, names, n=3) or names[:5]
     fix = f"Runs there are: {', '.join(near)}; choose one with --run." if near else "Train one first with `ugr fit`."
-    raise CheckpointError(where, expected, f"no run `{run}` under {root}", fix)
+    got = f"none in {folder}" if folder.is_dir() else f"no run `{run}` under {root}"
+    raise CheckpointError(where, expected, got, fix)
 
 
 def or_best(checkpoint: str | None, run: str | None) -> str | None:

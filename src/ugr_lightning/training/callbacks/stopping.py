@@ -17,10 +17,10 @@ WAITS = b"Stops when this validation is written; once more stops at once.\n"
 class OrderlyStop(Callback):
     """Writes `last.ckpt` when SIGINT, SIGTERM or SIGHUP ends the training, also before the first validation.
 
-    A signal waits for the end of the step, because half a step cannot be gone on from, and for the end of a validation,
-    which would not be made again: what it found and the best checkpoint are written first. A second one does not wait.
-    It has to come after `WeightAverage` and before callbacks that take long at a step's end. Of a training in several
-    processes the checkpoint of the last validated epoch stays.
+    A signal waits for the end of the step, because half a step cannot be gone on from, and for that of an epoch's last
+    validation, which would not be made again: what it found and the best checkpoint are written first. A second one
+    does not wait. It has to come after `WeightAverage` and before callbacks that take long at a step's end. Of a
+    training in several processes the checkpoint of the last validated epoch stays.
 
     Attributes:
         asked: the signal that has come, if one has.
@@ -46,8 +46,8 @@ class OrderlyStop(Callback):
             os.write(2, WAITS)  # `print` may be at work already
 
     def on_validation_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
-        """From here on a signal waits until its checkpoints are written, at the end of the epoch."""
-        self._in_validation = not trainer.sanity_checking
+        """From here on a signal waits until the checkpoints of the epoch are written, if this is its end."""
+        self._in_validation = trainer.fit_loop.epoch_loop.batch_progress.is_last_batch and not trainer.sanity_checking
 
     def on_train_epoch_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """The epoch before has left its checkpoints."""
@@ -57,10 +57,7 @@ class OrderlyStop(Callback):
         self._in_validation = False
 
     def on_train_batch_start(self, trainer: Trainer, pl_module: LightningModule, batch: Any, batch_idx: int) -> None:
-        """From here on a signal waits; of a validation within the epoch it has."""
-        validated, self._in_validation = self._in_validation, False
-        if validated and self.asked is not None:
-            raise Stopped(self.asked)
+        """From here on a signal waits."""
         self._in_step = True
 
     def on_train_batch_end(self, trainer: Trainer, pl_module: LightningModule, *_: Any) -> None:
