@@ -18,7 +18,7 @@ from ugr_lightning.rollout.simulators import Simulators
 from ugr_lightning.rollout.spec import RolloutSpec
 from ugr_lightning.rollout.trajectory import EpisodeTrace
 from ugr_lightning.sim.registry import robot_of
-from ugr_lightning.sim.seeds import SELECTION_START
+from ugr_lightning.sim.seeds import SELECTION_START, seeds_hash
 from ugr_lightning.training.callbacks.averaging import averaged_weights
 from ugr_lightning.training.tensorboard import log_figure, log_image
 
@@ -157,6 +157,7 @@ class RolloutEvaluation(Callback):
             self.task,
             seeds,
             setting=data.setting,
+            seeds_hash=seeds_hash([SELECTION_START]),
             image_size=data.image_size,
             execution=self.execution,
             workers=self.workers,
