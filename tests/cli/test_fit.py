@@ -465,17 +465,29 @@ def test_a_signal_to_the_loaders_too_as_a_terminal_sends_it_loses_nothing(tiny_c
     from ugr_lightning.training.module import PolicyModule
 
     original = PolicyModule.validation_step
+    many = [
+        "--data.num_workers",
+        "1",
+        "--data.val_stride",
+        "1",
+        "--data.batch_size",
+        "2",
+    ]  # more than it fetches
+
+    sent = []
 
     def interrupted(self, *arguments):
-        for process in [*multiprocessing.active_children(), multiprocessing.current_process()]:
+        for process in [*multiprocessing.active_children(), multiprocessing.current_process()] if not sent else ():
+            sent.append(process.pid)
             os.kill(process.pid, signal.SIGINT)
         return original(self, *arguments)
 
     with monkeypatch.context() as patch:
         patch.setattr(PolicyModule, "validation_step", interrupted)
-        assert main(["fit", "--config", tiny_config, "--data.num_workers", "1"]) == 130
-    assert "interrupted by SIGINT after step 3; `--checkpoint last` goes on" in capfd.readouterr().err
-    assert torch.load(RUN / "policy_best.ckpt", weights_only=True)["global_step"] == 3
+        assert main(["fit", "--config", tiny_config, *many]) == 130
+    assert len(sent) > 1, "there was a loader"
+    assert "interrupted by SIGINT after the last step" in capfd.readouterr().err
+    assert torch.load(RUN / "policy_best.ckpt", weights_only=True)["global_step"] == 6
 
 
 def test_an_interrupt_in_the_middle_of_a_step_leaves_the_checkpoint_before(tiny_config, monkeypatch):
