@@ -129,6 +129,7 @@ def test_a_teacher_takes_over_steps_that_each_rule_chooses(command, world, tiny_
     assert "| 50%, first | 5 | 10/10 = 100.0%" in (folder / "sweep.md").read_text()
     found = json.loads((folder / "sweep.json").read_text())
     assert found["teacher"]["file"] == str(teacher)
+    assert {item.refine_ratio for item in read_results(folder / "episodes.jsonl")} == {0, 0.5, 1}
     assert [use["successes"] for use in found["budgets"]["uses"]] == [0, 0, 0, 10, 10]
     assert "with 0%, coarse policy" in capsys.readouterr().out
     world.clear()

@@ -98,3 +98,13 @@ def test_the_folder_of_a_run_may_be_given_in_place_of_its_name(tmp_path, monkeyp
 
 def test_a_version_belongs_to_its_run():
     assert home_of(Path("runs/a/version_3")) == home_of(Path("runs/a")) == Path("runs/a")
+
+
+def test_a_run_that_saved_nothing_is_trained_anew_and_one_of_a_group_is_chosen(tmp_path):
+    (tmp_path / "short" / "version_0").mkdir(parents=True)
+    with pytest.raises(CheckpointError, match="train it anew"):
+        resolve_checkpoint("last", "short", tmp_path)
+    (tmp_path / "group" / "one" / "version_0").mkdir(parents=True)
+    (tmp_path / "group" / "one" / "version_0" / "last.ckpt").touch()
+    with pytest.raises(CheckpointError, match="choose one with --run"):
+        resolve_checkpoint("last", "group", tmp_path)
