@@ -3,11 +3,12 @@ import threading
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.speed import measurements as benchmark
-from ugr_lightning.speed.measurements import QUICK, Measurement, take_turns
+from ugr_lightning.speed.measurements import QUICK, Measurement, Pace, take_turns
 from ugr_lightning.speed.table import cells_of, print_cells
 
 
@@ -20,10 +21,13 @@ def test_every_part_is_measured_and_written_to_json(tmp_path, capsys):
     assert [name.split(",")[0] for name in names] == lines
     for item in content["measurements"]:
         assert item["value"] > 0
-        assert item["ratio"] == pytest.approx(
-            item["reference"] / item["value"] if item["unit"] == "ms" else item["value"] / item["reference"]
-        )
         assert item["name"] in said
+        assert (item["arithmetic"] or 1) > 0
+        if item["reference"] is not None:
+            better = item["reference"] / item["value"]
+            assert item["ratio"] == pytest.approx(better if item["unit"] == "ms" else 1 / better)
+    assert [item["arithmetic"] is None for item in content["measurements"]] == 3 * [False] + 2 * [True]
+    assert [item["reference"] is None for item in content["measurements"]] == [False, True, False, False, False]
     assert content["machine"]["threads"] == 1
     assert content["machine"]["CPU"] in said
 
@@ -52,6 +56,14 @@ def test_workloads_take_turns_after_one_warm_up_each():
     assert calls == ["a", "b"] + 3 * ["a", "b"]
 
 
+def test_the_arithmetic_of_a_workload_takes_as_many_products_as_it_has_operations(monkeypatch):
+    factor = torch.randn(256, 256)
+    monkeypatch.setattr(benchmark, "take_turns", lambda runs, _: dict.fromkeys(runs, Pace(1.0, 1.0)))
+    found = benchmark._measure("eight", lambda: [factor @ factor for _ in range(128)], None, 1, "")
+    assert found.arithmetic == pytest.approx(1e3 * 128 * 256**3 / 1024**3)
+    assert (found.value, found.reference, found.ratio) == (1e3, None, None)
+
+
 def test_waiting_costs_wall_time_but_no_processor_time():
     release = threading.Event()
     pace = take_turns({"wait": lambda: release.wait(0.05)}, rounds=1)["wait"]
@@ -59,10 +71,10 @@ def test_waiting_costs_wall_time_but_no_processor_time():
 
 
 def test_a_measurement_is_one_line(capsys):
-    for item in (Measurement("step", 10.0, "ms", 9.0, 33.0, 3.3, "fast"), Measurement("rate", 2500.0, "/s")):
+    for item in (Measurement("step", 10.0, "ms", 9.0, 6.0, 33.0, 3.3, "fast"), Measurement("rate", 2500.0, "/s")):
         print_cells(cells_of(item))
     first, second = capsys.readouterr().out.splitlines()
-    assert first.split() == ["step", "10.0", "ms", "9.0", "ms", "33.0", "ms", "3.30x", "fast"]
+    assert first.split() == ["step", "10.0", "ms", "9.0", "ms", "6.0", "ms", "33.0", "ms", "3.30x", "fast"]
     assert second.split() == ["rate", "2500", "/s"]
 
 

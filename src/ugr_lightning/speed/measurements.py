@@ -85,8 +85,10 @@ class Measurement(NamedTuple):
     Args:
         name: what was measured.
         value: the median, in `unit`.
-        unit: of `value`, `cpu` and `reference`.
+        unit: of all that follow, but for the ratio.
         cpu: the same by processor time instead of wall-clock time; None where several processes work.
+        arithmetic: how long its floating-point operations take in one large matrix product, measured in turns with it;
+            None where they are not counted. No exact change of a program makes it faster than that.
         reference: the median of what it is compared with, measured in turns with it; None where there is nothing.
         ratio: how many times better than the reference; None without one.
         aim: what the project promises, as a sentence fragment.
@@ -96,6 +98,7 @@ class Measurement(NamedTuple):
     value: float
     unit: str
     cpu: float | None = None
+    arithmetic: float | None = None
     reference: float | None = None
     ratio: float | None = None
     aim: str = ""
@@ -139,31 +142,17 @@ def measure_training(size: Size) -> Iterator[Measurement]:
         reference.loss(pixels, batch.state, batch.actions, batch.valid).backward()
         theirs.step()
 
-    paces = take_turns({"ours": step, "reference": reference_step}, size.rounds)
-    yield _slower_is_worse(f"training step, {_describe(size)}", paces, "at least 3.3 times faster")
+    yield _measure(f"training step, {_describe(size)}", step, reference_step, size.rounds, "at least 3.3 times faster")
 
 
 def measure_compact_step(size: Size) -> Iterator[Measurement]:
-    """A whole training step of `configs/uncert.yaml`, against its floating-point operations in one matrix product."""
+    """A whole training step of `configs/uncert.yaml`."""
     size = size._replace(batch=2 * size.batch, image_size=(size.image_size[0] // 2, size.image_size[1] // 2))
     torch.manual_seed(0)
     policy = ACT(refine=Uncertainty(), **{**COMPACT, **size.act})
     policy.set_statistics(_statistics())
-    batch, factor, optimizer = _batch(size), torch.randn(1024, 1024), compact_optimizer(policy)
-
-    def step() -> None:
-        compact_step(policy, optimizer, batch)
-
-    def multiply() -> None:
-        with torch.no_grad(), autocast(policy.precision, factor.device):
-            _ = factor @ factor
-
-    with FlopCounterMode(display=False) as counter:
-        step()
-    paces = take_turns({"ours": step, "product": multiply}, size.rounds)
-    products = counter.get_total_flops() / (2 * 1024**3)  # as many as the step has operations
-    paces["reference"] = Pace(*(products * seconds for seconds in paces.pop("product")))
-    yield _slower_is_worse(f"compact training step, {_describe(size)}", paces, "reference: its arithmetic alone")
+    step = partial(compact_step, policy, compact_optimizer(policy), _batch(size))
+    yield _measure(f"compact training step, {_describe(size)}", step, None, size.rounds, "")
 
 
 def compact_optimizer(policy: ACT) -> torch.optim.Optimizer:
@@ -192,13 +181,9 @@ def measure_query(size: Size) -> Iterator[Measurement]:
     def reference_query() -> None:
         reference(pixels, batch.state, latent)
 
-    runs: dict[str, Callable[[], Any]] = {
-        "ours": partial(policy.for_inference().predict, observation),  # as rollouts query it
-        "reference": reference_query,
-    }
-    paces = take_turns(runs, 3 * size.rounds)
+    query = partial(policy.for_inference().predict, observation)  # as rollouts query it
     name = f"one query, {_describe(size._replace(batch=1))}"
-    yield _slower_is_worse(name, paces, "at most 50 ms")
+    yield _measure(name, query, reference_query, 3 * size.rounds, "at most 50 ms")
 
 
 def measure_data(size: Size) -> Iterator[Measurement]:
@@ -219,7 +204,7 @@ def measure_data(size: Size) -> Iterator[Measurement]:
     for cached in ("ram", "memmap"):
         name = f"data path, one thread, cache {cached}, {_dimensions(size.image_size)}"
         rate, cpu_rate = samples / paces[cached].seconds, samples / paces[cached].cpu_seconds
-        yield Measurement(name, rate, "samples/s", cpu_rate, reference, rate / reference, "at least 2500")
+        yield Measurement(name, rate, "samples/s", cpu_rate, None, reference, rate / reference, "at least 2500")
 
 
 def measure_simulation(size: Size, processes: int) -> Iterator[Measurement]:
@@ -341,13 +326,32 @@ def _episode_rate(
     if len(workers) == 1:
         return Measurement(name, rates["one"], "episodes/min")
     aim = "at least 1.8 times one's" if len(workers) == 2 else ""
-    return Measurement(name, rates["all"], "episodes/min", None, rates["one"], rates["all"] / rates["one"], aim)
+    ratio = rates["all"] / rates["one"]
+    return Measurement(name, rates["all"], "episodes/min", reference=rates["one"], ratio=ratio, aim=aim)
 
 
-def _slower_is_worse(name: str, paces: dict[str, Pace], aim: str) -> Measurement:
-    ours, reference = paces["ours"], paces["reference"]
-    times = 1e3 * ours.seconds, "ms", 1e3 * ours.cpu_seconds, 1e3 * reference.seconds
-    return Measurement(name, *times, reference.seconds / ours.seconds, aim)
+def _measure(
+    name: str, ours: Callable[[], Any], reference: Callable[[], Any] | None, rounds: int, aim: str
+) -> Measurement:
+    """Time a workload of the network in turns with the reference and with its floating-point operations alone."""
+    side = 1024
+    factor = torch.randn(side, side)
+
+    def multiply() -> None:
+        with torch.no_grad(), autocast("auto", factor.device):
+            _ = factor @ factor
+
+    with FlopCounterMode(display=False) as counter:
+        ours()
+    products = counter.get_total_flops() / (2 * side**3)
+    workloads = {"ours": ours, "product": multiply} | ({"reference": reference} if reference else {})
+    paces = take_turns(workloads, rounds)
+    took, alone = paces["ours"], 1e3 * products * paces["product"].seconds
+    measured = Measurement(name, 1e3 * took.seconds, "ms", 1e3 * took.cpu_seconds, alone, aim=aim)
+    if reference is None:
+        return measured
+    compared = paces["reference"].seconds
+    return measured._replace(reference=1e3 * compared, ratio=compared / took.seconds)
 
 
 def _describe(size: Size) -> str:

@@ -24,8 +24,8 @@ from ugr_lightning.system.limits import usable_cores
 
 Part = Literal["training", "compact", "query", "data", "simulation"]
 PARTS: tuple[Part, ...] = get_args(Part)
-HEAD = ("what", "here", "by CPU time", "reference", "ratio", "aim")
-WIDTHS = (52, 16, 16, 16, 7, 26)
+HEAD = ("what", "here", "by CPU time", "arithmetic alone", "reference", "ratio", "aim")
+WIDTHS = (52, 16, 16, 16, 16, 7, 26)
 
 
 def measure(
@@ -72,10 +72,9 @@ def describe_machine() -> dict[str, Any]:
 
 def cells_of(item: Measurement) -> tuple[str, ...]:
     """A measurement under `HEAD`."""
-    reference = "" if item.reference is None else f"{_number(item.reference)} {item.unit}"
     ratio = "" if item.ratio is None else f"{item.ratio:.2f}x"
-    cpu = "" if item.cpu is None else f"{_number(item.cpu)} {item.unit}"
-    return item.name, f"{_number(item.value)} {item.unit}", cpu, reference, ratio, item.aim
+    times = ("" if t is None else f"{_number(t)} {item.unit}" for t in (item.cpu, item.arithmetic, item.reference))
+    return item.name, f"{_number(item.value)} {item.unit}", *times, ratio, item.aim
 
 
 def print_cells(cells: Sequence[str], widths: Sequence[int] = WIDTHS) -> None:
