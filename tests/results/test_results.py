@@ -131,3 +131,13 @@ def test_table_has_a_row_per_policy_with_n_and_interval():
     assert "[9.5%, 90.5%]" in table[2]
     assert "zero" in table[3]
     assert "0/1" in table[3]
+
+
+def test_a_policy_is_called_by_its_selector_and_by_its_checkpoint_only_where_names_are_alike():
+    def column(*items):
+        return [line.split("  ")[2].strip() for line in success_table(items).splitlines()[2:]]
+
+    uncert, block = (result(policy="ACT", checkpoint=64 * "a", refine=name) for name in ("Uncertainty", "Block"))
+    plain, other = (result(policy="ACT", checkpoint=64 * letter) for letter in "bc")
+    assert column(uncert, block, plain) == ["ACT Uncertainty", "ACT Block", "ACT"]
+    assert column(plain, other, uncert) == ["ACT bbbbbbbb", "ACT cccccccc", "ACT Uncertainty"], "never put together"

@@ -11,6 +11,7 @@ from fake_simulator import HOME, FakeSimulator
 
 from ugr_lightning.contract import CAMERAS, Observation
 from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.results.results import read_results
 from ugr_lightning.rollout.actors import ROWS, Actor, Decision, PolicyActor
 from ugr_lightning.rollout.aggregation import make_execution
@@ -44,7 +45,9 @@ def outcome(results):
 
 @pytest.mark.parametrize("execution", ["aggregate", 3, "5"])
 def test_a_policy_is_judged_seed_by_seed(runner, execution):
-    results = runner(PolicyActor(Reacher(), checkpoint="abc", refine_ratio=0.2), SEEDS, execution=execution)
+    policy = Reacher()
+    policy.refine = Uncertainty()
+    results = runner(PolicyActor(policy, checkpoint="abc", refine_ratio=0.2), SEEDS, execution=execution)
     assert [result.seed for result in results] == SEEDS
     assert all(result.success and result.first_success_step == result.steps for result in results)
     first = results[0]
@@ -52,7 +55,8 @@ def test_a_policy_is_judged_seed_by_seed(runner, execution):
     assert first.seeds_hash == seeds_hash(SEEDS)
     assert first.log_variance == {"mean": -3.0, "max": -1.0}
     assert set(first.seconds) == {"query", "simulate"}
-    assert first.refine_ratio == 0.2
+    assert (first.refine, first.refine_ratio) == ("Uncertainty", 0.2)
+    assert PolicyActor(Reacher()).refine is None
     every = 1 if execution == "aggregate" else int(execution)
     assert first.queries == -(-first.steps // every)
 

@@ -4,6 +4,7 @@ import fcntl
 import json
 import math
 import os
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -49,6 +50,8 @@ class EpisodeResult:
         alarm_rate: share of successes, at most, in which the alarm is raised that watched; None where none did.
         image_size: height and width of the pictures that were looked at; None where nobody looked, and in files from
             before this field.
+        refine: class of what chose the steps that were refined, such as `Uncertainty`; None where none were, and in
+            files from before this field.
     """
 
     task: str
@@ -72,6 +75,7 @@ class EpisodeResult:
     alarm: int | None = None
     alarm_rate: float | None = None
     image_size: list[int] | None = None
+    refine: str | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Plain containers, ready for JSON."""
@@ -139,12 +143,21 @@ def summarize(results: Iterable[EpisodeResult]) -> Summary:
 
 
 def success_table(results: Sequence[EpisodeResult]) -> str:
-    """A plain-text table, n and interval beside every rate: one row per (task, setting, policy, execution)."""
-    groups: dict[tuple[str, str, str, str], list[EpisodeResult]] = {}
+    """A plain-text table, n and interval beside every rate: one row per (task, setting, policy, execution).
+
+    A policy is called by its class and its selector, and by the first digits of its checkpoint where several are called
+    alike.
+    """
+    groups: dict[tuple[str, str, tuple[str, str], str], list[EpisodeResult]] = {}
     for result in results:
-        groups.setdefault((result.task, result.setting, result.policy, result.execution), []).append(result)
+        policy = (result.policy + (f" {result.refine}" if result.refine else ""), (result.checkpoint or "")[:8])
+        groups.setdefault((result.task, result.setting, policy, result.execution), []).append(result)
+    called = Counter(name for name, _ in {policy for _, _, policy, _ in groups})
     rows = [("task", "setting", "policy", "execution", "success", "95 % interval", "crashed")]
-    return as_text(rows + [(*key, *summarize(group).cells()) for key, group in groups.items()])
+    for (task, setting, (name, checkpoint), execution), group in groups.items():
+        policy_name = f"{name} {checkpoint}".rstrip() if called[name] > 1 else name
+        rows.append((task, setting, policy_name, execution, *summarize(group).cells()))
+    return as_text(rows)
 
 
 def append_result(path: str | Path, result: EpisodeResult) -> None:

@@ -76,6 +76,7 @@ class Actor(ABC):
         name: what results call it.
         execution: how chunks are executed, as results say it; `1` where there are no chunks.
         cameras: the pictures it needs; without any the simulators do not render.
+        refine: class of what chooses the steps that are refined, or None.
         refine_ratio: share of each chunk that is refined, where that is not as in training.
         checkpoint: SHA-256 of the checkpoint that acts, or None.
         alarm: what raises an alarm in this run, or None.
@@ -84,6 +85,7 @@ class Actor(ABC):
 
     name: str
     execution: str = "1"
+    refine: str | None = None
     refine_ratio: float | None = None
     checkpoint: str | None = None
     alarm: Alarm | None = None
@@ -210,6 +212,8 @@ class PolicyActor(Actor):
         self.policy, self.state, self.refine_ratio = policy, state, refine_ratio
         self.name, self.checkpoint, self.control_hz = name or type(policy).__name__, checkpoint, control_hz
         self.cameras, self.alarms = tuple(policy.cameras), alarms or {}
+        chooses = getattr(policy, "refine", None)  # of policies that refine
+        self.refine = type(chooses).__name__ if chooses is not None else None
         self._views, self._present = [list(cameras).index(camera) for camera in self.cameras], len(cameras)
         self._execution: Execution | None = None
         self._was_training = False

@@ -222,6 +222,7 @@ def _result(episode: RunningEpisode, crash: str | None, actor: Actor, spec: Roll
         alarm=episode.trace.alarm,
         alarm_rate=None if actor.alarm is None else actor.alarm.rate,
         image_size=list(spec.image_size) if actor.cameras else None,
+        refine=actor.refine,
     )
 
 
