@@ -21,7 +21,6 @@ def calls(monkeypatch):
         return function
 
     where = "ugr_lightning.demos"
-    monkeypatch.setattr(f"{where}.gallery.make_gallery", note("gallery", Path("gallery.md")))
     monkeypatch.setattr(f"{where}.survey.survey", note("survey", "row"))
     monkeypatch.setattr(f"{where}.survey.write_survey", note("write", "the table"))
     monkeypatch.setattr(f"{where}.verify.verify_determinism", note("determinism", Verification("motion", 50, ())))
@@ -61,14 +60,6 @@ def test_evaluation_seeds_are_found_for_the_task_that_is_asked_for(calls, capsys
     assert main(["tasks", "seeds", "handover_block", "--count", "20", "--workers", "1"]) == 0
     assert calls == [("find", ("handover_block",), {"count": 20, "workers": 1})]
     assert capsys.readouterr().out == "list.json\n"
-
-
-def test_the_gallery_shows_what_is_asked_for(calls, capsys):
-    options = ["gallery", "pictures", "--task", "handover_block", "--setting", "demo_randomized"]
-    assert main(["tasks", *options]) == 0
-    assert [name for name, _, _ in calls] == ["probe", "gallery"]
-    assert calls[1][1] == ("pictures", ("handover_block",), ("demo_randomized",))
-    assert "gallery.md" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`ugr tasks`: list, measure, verify and picture the simulated tasks."""
+"""`ugr tasks`: list, measure and verify the simulated tasks."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -110,24 +110,6 @@ def _seeds(task: str, count: Count = 100, workers: Count = 2) -> int:
     return 0
 
 
-def _gallery(folder: str, task: str = "all", setting: str = "all", workers: Count = 2) -> int:
-    """Picture tasks: stills, GIFs of the expert, and a page that shows them, gallery.md.
-
-    Args:
-        folder: where they go.
-        task: a name, or `all`: all but outside ones.
-        setting: `demo_clean`, `demo_randomized`, or `all`.
-        workers: simulator processes.
-    """
-    from ugr_lightning.demos.gallery import make_gallery
-    from ugr_lightning.sim.render import require_rendering
-
-    tasks, settings = named_tasks(task), _settings(task, setting)
-    require_rendering()
-    print(make_gallery(folder, tasks, settings, workers=workers))
-    return 0
-
-
 def _settings(task: str, setting: str) -> tuple[str, ...]:
     if setting != "all":
         check_setting(setting)
@@ -140,5 +122,4 @@ FUNCTIONS: dict[str, tuple[Callable[..., int], Sequence[str]]] = {
     "measure": (_measure, ["out"]),
     "verify": (_verify, ["task"]),
     "seeds": (_seeds, ["task"]),
-    "gallery": (_gallery, ["folder"]),
 }
