@@ -17,7 +17,7 @@ from jsonargparse import ArgumentParser
 from ugr_lightning.cli.main import COMMANDS, main
 
 FOLDER = Path(__file__).parent / "help"
-ONE_OF = {"tasks": ("list", "measure", "verify", "seeds"), "data": ("inspect", "convert")}
+ONE_OF = {"tasks": ("list", "verify", "seeds"), "data": ("inspect", "convert")}
 ONE_OF |= {"bridge": ("robotwin", "xpolicylab", "serve")}
 LINES = ["", *(f"{name} {part}".strip() for name in COMMANDS for part in ("", *ONE_OF.get(name, ())))]
 LIGHTNINGS = ("trainer.", "optimizer.", "lr_scheduler.", "seed_everything", "verbose")

@@ -71,7 +71,7 @@ SLOW |= {"sapien", "mani_skill", "gymnasium", "imageio", "rerun", "pyarrow", "on
 TRAINING = {"torch", "lightning", "scipy", "matplotlib", "PIL", "h5py"}  # Lightning itself brings the first five
 MAY_LOAD = {"doctor": {"torch"}, "import-act": {"torch"}, "import-lerobot": {"torch"}, "refine": {"torch"}}
 MAY_LOAD |= {"fit": TRAINING, "validate": TRAINING}
-PARTS = ("tasks list", "tasks measure", "data inspect", "data convert", "bridge robotwin", "bridge serve")
+PARTS = ("tasks list", "tasks verify", "data inspect", "data convert", "bridge robotwin", "bridge serve")
 LINES = ["tasks", *(f"{line} --help" for line in (*COMMANDS, *PARTS))]
 
 

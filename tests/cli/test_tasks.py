@@ -4,8 +4,7 @@ import pytest
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.demos.verify import Verification
-from ugr_lightning.sim.settings import SETTINGS
-from ugr_lightning.sim.tasks import all_task_names, task_names
+from ugr_lightning.sim.tasks import all_task_names
 
 
 @pytest.fixture
@@ -20,13 +19,10 @@ def calls(monkeypatch):
 
         return function
 
-    where = "ugr_lightning.demos"
-    monkeypatch.setattr(f"{where}.survey.survey", note("survey", "row"))
-    monkeypatch.setattr(f"{where}.survey.write_survey", note("write", "the table"))
-    monkeypatch.setattr(f"{where}.verify.verify_determinism", note("determinism", Verification("motion", 50, ())))
-    monkeypatch.setattr(f"{where}.verify.verify_evaluation_seeds", note("seeds", Verification("list", 101, (100007,))))
-    monkeypatch.setattr(f"{where}.verify.find_evaluation_seeds", note("find", Path("list.json")))
-    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", note("probe", None))
+    where = "ugr_lightning.demos.verify"
+    monkeypatch.setattr(f"{where}.verify_determinism", note("determinism", Verification("motion", 50, ())))
+    monkeypatch.setattr(f"{where}.verify_evaluation_seeds", note("seeds", Verification("list", 101, (100007,))))
+    monkeypatch.setattr(f"{where}.find_evaluation_seeds", note("find", Path("list.json")))
     return asked
 
 
@@ -35,16 +31,6 @@ def test_tasks_are_listed_all_or_one(capsys):
     assert [line.split()[0] for line in capsys.readouterr().out.splitlines()] == list(all_task_names())
     assert main(["tasks", "list", "handover_block"]) == 0
     assert capsys.readouterr().out.startswith("handover_block ")
-
-
-def test_measuring_goes_over_all_tasks_and_settings_and_prints_the_table(calls, capsys):
-    assert main(["tasks", "measure", "out/table", "--recordings", "0", "--dummy_episodes", "7"]) == 0
-    surveys = [(args[0], options["setting"]) for name, args, options in calls if name == "survey"]
-    assert surveys == [(task, setting) for task in task_names() for setting in SETTINGS]
-    assert calls[0][2] == {"setting": "demo_clean", "episodes": 200, "dummy_episodes": 7, "recordings": 0, "workers": 2}
-    assert calls[1] == ("write", (Path("out/table"), "row"), {})
-    assert "probe" not in [name for name, _, _ in calls]
-    assert "the table" in capsys.readouterr().out
 
 
 def test_verifying_prints_every_comparison_and_a_difference_is_exit_code_2(calls, capsys):

@@ -14,7 +14,7 @@ from ugr_lightning.system.signals import Stopped, stoppable
 COMMANDS: dict[str, tuple[str, str]] = {
     "demo": ("demo", "the whole loop in minutes: record, train, evaluate, show a table"),
     "doctor": ("doctor", "check this machine and say what to do"),
-    "tasks": ("tasks", "list the simulated tasks; measure and verify them"),
+    "tasks": ("tasks", "list the simulated tasks; verify them"),
     "collect": ("collect", "record demonstrations of a task's scripted expert"),
     "fit": ("fit", "train a policy; records missing demonstrations first"),
     "validate": ("fit", "validation losses and errors of a checkpoint"),

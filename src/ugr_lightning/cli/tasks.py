@@ -1,10 +1,9 @@
-"""`ugr tasks`: list, measure and verify the simulated tasks."""
+"""`ugr tasks`: list and verify the simulated tasks."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
-from ugr_lightning.cli.parsing.call import Count, CountOrZero, call_one_of
+from ugr_lightning.cli.parsing.call import Count, call_one_of
 from ugr_lightning.sim.outside_simulator import SETTING
 from ugr_lightning.sim.settings import SETTINGS, check_setting
 from ugr_lightning.sim.task_files import outside_names
@@ -24,47 +23,6 @@ def _list(task: str = "all") -> int:
     """
     for name in (*named_tasks(task), *(outside_names() if task == "all" else ())):
         print(f"{name:<20}{task_summaries()[name]}")
-    return 0
-
-
-def _measure(
-    out: str,
-    task: str = "all",
-    setting: str = "all",
-    episodes: Count = 200,
-    dummy_episodes: CountOrZero = 50,
-    recordings: CountOrZero = 5,
-    workers: Count = 2,
-) -> int:
-    """Measure success, length and cost of tasks on seeds from 400000.
-
-    Args:
-        out: `NAME` writes NAME.md and NAME.json; rows that are there from before stay, unless they are measured again.
-        task: a name, or `all`: all but outside ones.
-        setting: `demo_clean`, `demo_randomized`, or `all`.
-        episodes: seeds of the expert.
-        dummy_episodes: seeds of `zero` and `random`; they run to the horizon.
-        recordings: episodes recorded at each picture size; 0 needs no renderer.
-        workers: simulator processes.
-    """
-    from ugr_lightning.demos.survey import survey, write_survey
-    from ugr_lightning.sim.render import require_rendering
-
-    chosen = [(name, each) for name in named_tasks(task) for each in _settings(task, setting)]
-    if recordings:
-        require_rendering()
-    table = ""
-    for name, each in chosen:
-        row = survey(
-            name,
-            setting=each,
-            episodes=episodes,
-            dummy_episodes=dummy_episodes,
-            recordings=recordings,
-            workers=workers,
-        )
-        table = write_survey(Path(out), row)
-    print(table)
     return 0
 
 
@@ -119,7 +77,6 @@ def _settings(task: str, setting: str) -> tuple[str, ...]:
 
 FUNCTIONS: dict[str, tuple[Callable[..., int], Sequence[str]]] = {
     "list": (_list, ["task"]),
-    "measure": (_measure, ["out"]),
     "verify": (_verify, ["task"]),
     "seeds": (_seeds, ["task"]),
 }

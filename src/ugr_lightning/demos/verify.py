@@ -1,16 +1,83 @@
 """What makes a benchmark one: the same seed is the same episode, and the listed seeds are the right ones."""
 
+import hashlib
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from ugr_lightning.data.selection import shorten
-from ugr_lightning.demos.survey import FIRST_SEED, Performance, perform
 from ugr_lightning.errors import SimulationError
+from ugr_lightning.sim.registry import open_simulator
 from ugr_lightning.sim.seeds import EVALUATION_START, evaluation_seeds, seeds_hash
+from ugr_lightning.sim.simulator import Simulator
 from ugr_lightning.sim.tasks import seeds_file, task_version
 from ugr_lightning.system.files import publish_text
+from ugr_lightning.system.progress import Progress
+from ugr_lightning.system.spread import spread
+
+FIRST_SEED = 400_000
+"""Fresh seeds for statistics: apart from demonstrations, evaluation and selection."""
+
+
+class Performance(NamedTuple):
+    """How the expert did on a seed, without noise and to the end of its script.
+
+    Args:
+        seed: simulator seed.
+        success: whether the task's condition was met.
+        steps: control steps of the whole script: the length of a demonstration.
+        motion_hash: SHA-256 of the measured joints of all frames, the last one included.
+        gave_up: what the expert could not reach, which ended its script; None where there was no such pose.
+    """
+
+    seed: int
+    success: bool
+    steps: int
+    motion_hash: str
+    gave_up: str | None = None
+
+
+class Performer:
+    """Lets the expert perform seeds; lives in a worker process.
+
+    Args:
+        open_task: opens the simulator.
+    """
+
+    def __init__(self, open_task: Callable[[], Simulator]) -> None:
+        self._simulator = open_task()
+
+    def perform(self, seed: int) -> Performance:
+        """One episode of the expert."""
+        frame, steps = self._simulator.reset(seed), 0
+        motion = hashlib.sha256(np.asarray(frame.measured).tobytes())
+        for intention in self._simulator.expert():
+            frame, steps = self._simulator.step(intention.action), steps + 1
+            motion.update(np.asarray(frame.measured).tobytes())
+        return Performance(seed, bool(frame.success), steps, motion.hexdigest(), self._simulator.gave_up)
+
+
+def perform(task: str, seeds: Sequence[int], *, setting: str = "demo_clean", workers: int = 1) -> list[Performance]:
+    """Let the expert perform some seeds, without pictures.
+
+    Returns:
+        One item per seed, in order; a simulator that was lost counts as a failure of no steps.
+    """
+    open_task = partial(open_simulator, task, setting=setting, render=False)
+    results: dict[int, Performance] = {}
+    with Progress(f"{task}, {setting}: expert", len(seeds)) as line:
+        for done in spread(partial(Performer, open_task), "perform", seeds, workers=workers):
+            if done.fault is not None:
+                line.message(f"Seed {seeds[done.job]} counts as a failure: {done.fault}")
+            found = results[done.job] = done.value or Performance(seeds[done.job], False, 0, "")
+            if found.gave_up is not None:
+                line.message(f"Seed {found.seed}: {found.gave_up}")
+            line.advance(f"{sum(item.success for item in results.values())} solved")
+    return [results[index] for index in range(len(seeds))]
 
 
 class Verification(NamedTuple):

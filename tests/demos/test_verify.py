@@ -6,22 +6,20 @@ import pytest
 from fake_simulator import STEPS, FakeSimulator
 
 from ugr_lightning.demos import verify
-from ugr_lightning.demos.survey import Performer, perform, read_surveys, survey, write_survey
-from ugr_lightning.demos.verify import find_evaluation_seeds, verify_determinism, verify_evaluation_seeds
-from ugr_lightning.errors import DataError, SimulationError
-from ugr_lightning.results.results import wilson_interval
+from ugr_lightning.demos.verify import (
+    Performer,
+    find_evaluation_seeds,
+    perform,
+    verify_determinism,
+    verify_evaluation_seeds,
+)
+from ugr_lightning.errors import SimulationError
 from ugr_lightning.sim import seeds
 from ugr_lightning.sim.registry import open_simulator
 
 pytestmark = pytest.mark.usefixtures("fake_tasks")
 
 QUICK = {"workers": 1}
-SMALL = QUICK | {"image_sizes": ((12, 16), (24, 32)), "episodes": 10, "dummy_episodes": 2, "recordings": 2}
-
-
-@pytest.fixture(scope="module")
-def row(fake_tasks):
-    return survey("reach", first_seed=0, **SMALL)
 
 
 def perform_here(task, seeds, *, opened=open_simulator, **_):
@@ -47,45 +45,6 @@ def test_a_pose_out_of_reach_is_told_with_its_seed(capsys):
     results = perform("out_of_reach", [2, 3], **QUICK)
     assert [item.success for item in results] == [True, False]
     assert "Seed 3: left arm, phase `reach`: expected a tool pose within its reach, got" in capsys.readouterr().err
-
-
-def test_a_row_counts_successes_lengths_and_costs(row):
-    assert (row.expert.successes, row.expert.n) == (8, 10)  # the expert gives up on 3 and 8
-    assert (row.expert.low, row.expert.high) == wilson_interval(8, 10)
-    assert row.failures == (3, 8)
-    assert row.steps == (STEPS, STEPS, STEPS)
-    assert (row.zero.successes, row.zero.n) == (0, 2)
-    assert row.random.n == 2
-    assert [cost.image_size for cost in row.recordings] == [(12, 16), (24, 32)]
-    assert all(cost.episodes == 2 and cost.seconds > 0 for cost in row.recordings)
-    assert 0 < row.recordings[0].megabytes < row.recordings[1].megabytes
-
-
-def test_dummies_and_recordings_can_be_left_out():
-    row = survey("reach", first_seed=0, **SMALL | {"dummy_episodes": 0, "recordings": 0, "episodes": 1})
-    assert (row.zero.n, row.random.n, row.recordings) == (0, 0, ())
-    assert row.expert.n == 1
-
-
-def test_rows_are_added_and_replaced_in_both_files(row, tmp_path):
-    stem = tmp_path / "table"
-    write_survey(stem, row)
-    write_survey(stem, row.__class__(**{**row.__dict__, "setting": "demo_randomized", "recordings": ()}))
-    table = write_survey(stem, row)
-    assert (tmp_path / "table.md").read_text() == table
-    rows = read_surveys(tmp_path / "table.json")
-    assert [found["setting"] for found in rows] == ["demo_clean", "demo_randomized"]
-    assert rows[0]["failures"] == [3, 8]
-    assert "| reach | demo_clean | 8/10 [49.0, 94.3] | 12 (12 to 12) | 0/2 [0.0, 65.8] |" in table
-    assert "s at 16x12 | MB at 16x12 | s at 32x24" in table
-    assert len({line.count("|") for line in table.splitlines() if line.startswith("|")}) == 1
-
-
-def test_a_file_of_something_else_is_not_overwritten(row, tmp_path):
-    (tmp_path / "table.json").write_text(json.dumps([{"task": "reach"}]))
-    with pytest.raises(DataError, match="Move it away"):
-        write_survey(tmp_path / "table", row)
-    assert json.loads((tmp_path / "table.json").read_text()) == [{"task": "reach"}]
 
 
 class Remembering(FakeSimulator):
