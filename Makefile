@@ -29,7 +29,7 @@ test: setup  ## run the tests
 fuzz: setup  ## damage files of every format at random and read them; minutes
 	$(BIN)/python -m pytest tests/fuzz_readers.py $(ARGS)
 
-evidence: setup  ## kill, fill, damage and double what writes, and see; an hour, goes on where it was stopped
+evidence: setup  ## kill, fill, lock and double what writes, and see; most of an hour, goes on where it was stopped
 	$(BIN)/python tests/evidence $(ARGS)
 
 lint: $(PACKAGES)  ## ruff check, ruff format --check, mypy

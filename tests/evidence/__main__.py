@@ -18,10 +18,8 @@ from typing import Any
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "stand_ins"))
 
-import disturbances
-import serving
-import suites
 import torch
+from disturbances import PIECES
 from jobs import write_tasks
 from trial import NotHereError, Piece
 
@@ -29,7 +27,6 @@ import ugr_lightning.cli.collect
 import ugr_lightning.cli.fit
 import ugr_lightning.cli.rollout  # noqa: F401  commands are forked: they find all of this imported
 
-PIECES = [*disturbances.PIECES, *serving.PIECES, *suites.PIECES]
 HEADING = """# When things go wrong
 
 Made by `make evidence`, which goes on where it was stopped; `make evidence ARGS="--only 'killed/*'"` runs a part. Every

@@ -73,15 +73,11 @@ class Command:
         self.process.join(TIMEOUT_S)
         if self.process.exitcode is None:
             self.process.kill()
-        said = self.heard()
+        said = self._said.read_text(errors="replace") if self._said.is_file() else ""
         about = f"ugr {' '.join(self.words)}: exit code {self.process.exitcode}, said ...{said[-1500:]}"
         assert self.process.exitcode in (codes or (0,)), about
         assert "Traceback" not in said, about
         return said
-
-    def heard(self) -> str:
-        """What it has said so far."""
-        return self._said.read_text(errors="replace") if self._said.is_file() else ""
 
     def kill_after(self, begun: Callable[[], bool], seconds: float) -> bool:
         """SIGKILL it some time after its work has begun; whether it was still at it."""
