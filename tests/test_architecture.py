@@ -28,7 +28,7 @@ ROOMS = {
     "data": GROUND,
     "results": GROUND,
     "rollout": PARTS | {"results"},
-    "demos": PARTS | {"results", "rollout"},
+    "demos": PARTS | {"rollout"},
     "training": PARTS | {"results", "rollout"},
     "uncertainty": PARTS | {"results", "rollout"},
     "speed": PARTS | {"results", "rollout"},

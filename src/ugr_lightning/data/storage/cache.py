@@ -4,16 +4,13 @@ import hashlib
 import json
 import os
 import shutil
-import sys
-import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from rich.progress import track
 
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.storage.frames import shrink
@@ -21,6 +18,7 @@ from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.system.files import publish
 from ugr_lightning.system.limits import available_memory, usable_cores
 from ugr_lightning.system.lock import locked
+from ugr_lightning.system.progress import Progress
 
 Cache = Literal["ram", "memmap", "none"]
 OPEN_EPISODES = 64
@@ -198,21 +196,10 @@ def _decode_all(episodes: Sequence[Episode], out: np.ndarray) -> None:
             read_resized(episode, step, out[starts[index] + step])
         episode.frames.close()
 
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        for _ in _shown(pool.map(decode, range(len(episodes))), len(episodes), out.nbytes):
-            pass
-
-
-def _shown(results: Iterator[None], count: int, size: int) -> Iterator[None]:
-    """Pass results on and show how far decoding is: a bar on a terminal, a line before and after elsewhere."""
-    what = f"Decoding {count} episodes into {size / 1e9:.2f} GB"
-    if sys.stderr.isatty():
-        yield from track(results, what, total=count, transient=True)
-        return
-    print(what, file=sys.stderr, flush=True)
-    start = time.monotonic()
-    yield from results
-    print(f"Decoded {count} episodes, {size / 1e9:.2f} GB, in {time.monotonic() - start:.1f} s", file=sys.stderr)
+    title = f"Decoding episodes into {out.nbytes / 1e9:.2f} GB"
+    with ThreadPoolExecutor(usable_cores()) as pool, Progress(title, len(episodes)) as line:
+        for _ in pool.map(decode, range(len(episodes))):
+            line.advance()
 
 
 def _require_space(shape: tuple[int, ...], free: int | None, what: str, fix: str) -> None:

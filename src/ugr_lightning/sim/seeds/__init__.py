@@ -11,7 +11,6 @@ from typing import Literal
 from ugr_lightning.errors import ConfigError, SimulationError
 from ugr_lightning.sim.tasks import seeds_file, task_version
 
-DEMONSTRATION_START = 0
 EVALUATION_START = 100_000
 SELECTION_START = 200_000
 
