@@ -29,9 +29,7 @@ def test_analyze_writes_numbers_tables_and_figures_and_says_one_sentence(command
     assert found["verdict"] in said
     assert "On 2 validation episodes s_k " in found["verdict"]
     assert found["validation"] == {"episodes": 2, "chunks": 6}  # 12 steps, every fifth
-    prior = json.loads((folder / "prior.json").read_text())
-    assert prior == found["position"]["training_error"]
-    assert len(prior) == 5
+    assert len(found["position"]["training_error"]) == 5
     assert found["verdict"] in (folder / "analysis.md").read_text()
     assert {row["name"] for row in found["statistics"]} >= {"AUSE", "NLL, nats", "Spearman within position"}
     assert {"close", "open"} <= set(found["events"])  # the made-up grippers move at random

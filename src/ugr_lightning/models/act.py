@@ -170,9 +170,6 @@ class ACT(TokenPolicy):
         )
         if dim % heads or dim % 4:
             raise ConfigError("dim", f"a multiple of heads ({heads}) and of 4", dim, "Change `dim` or `heads`.")
-        if refine is not None and refine.offline:
-            fix = "Compare with it offline: `ugr analyze --budgets`."
-            raise ConfigError("refine", "a rule that knows what a policy knows", type(refine).__name__, fix)
         wants_uncertainty = uncertainty_head or (refine is not None and refine.needs_uncertainty)
         if uncertainty_holdout and (uncertainty_holdout < 2 or not wants_uncertainty):
             fix = "Set it to 0, or to 5 for every fifth episode, with `uncertainty_head: true` if `refine` needs none."

@@ -21,7 +21,6 @@ from ugr_lightning.rollout.traces import read_traces
 from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
 from ugr_lightning.uncertainty.budgets import sweep, sweep_figure, sweep_table
-from ugr_lightning.uncertainty.calibration import position_mean
 from ugr_lightning.uncertainty.calibration_figures import calibration_figure, event_figure
 from ugr_lightning.uncertainty.estimators import estimate, estimator_table
 from ugr_lightning.uncertainty.events import KINDS, find_events
@@ -64,11 +63,9 @@ class Study:
         return "\n\n".join([*map(as_text, self.tables), *self.sentences])
 
     def write(self, folder: Path) -> None:
-        """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
+        """Write `analysis.json`, `analysis.md` and the figures."""
         title = f"Uncertainty of {self.content['checkpoint']['file']}"
         write_page(folder, "analysis", title, self.sentences, self.tables, self.figures, self.content)
-        prior = json.dumps(plain_json(position_mean(self.training.coarse)))
-        publish_text(folder / "prior.json", prior + "\n")
 
 
 def write_page(
