@@ -22,7 +22,7 @@ from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
 from ugr_lightning.uncertainty.budgets import sweep, sweep_figure, sweep_table
 from ugr_lightning.uncertainty.calibration_figures import calibration_figure, event_figure
-from ugr_lightning.uncertainty.estimators import estimate, estimator_table
+from ugr_lightning.uncertainty.estimators import estimator_table, overlapping
 from ugr_lightning.uncertainty.events import KINDS, find_events
 from ugr_lightning.uncertainty.failure import Alarms, Score, detect_failures, overlap_score, uncertainty_score
 from ugr_lightning.uncertainty.foretold import foretold, foretold_table
@@ -175,15 +175,17 @@ def add_budgets(study: Study) -> None:
 
 
 def add_estimators(study: Study) -> None:
-    """Add other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+    """Add another estimate of the uncertainty: overlapping chunks.
 
     Raises:
-        ConfigError: the policy has no s_k to compare them with.
+        ConfigError: the policy has no s_k to compare it with, or its chunks do not overlap.
     """
     _require_uncertainty(study, "--estimators")
-    assert isinstance(study.policy, ACT)
-    estimates = estimate(study.policy, study.data, study.data.episode_split.validation, stride=study.stride)
-    table = estimator_table(study.validation, estimates, study.budget)
+    if study.stride >= study.policy.chunk_length:
+        expected = f"chunks of {study.policy.chunk_length} steps that overlap"
+        raise ConfigError("--estimators", expected, f"one every {study.stride} steps", "Lower --stride.")
+    overlap = overlapping(study.policy, study.data, study.data.episode_split.validation, stride=study.stride)
+    table = estimator_table(study.validation, {"overlapping chunks": overlap}, study.budget)
     study.content["estimators"] = table
     study.tables.append(table)
 
