@@ -73,8 +73,6 @@ def configured(path: Path) -> ChunkPolicy:
             chosen = {"class_path": found["class_path"], "init_args": {}}
         chosen["init_args"] |= found.get("init_args", {})
     options = chosen["init_args"] | {"precision": "fp32"} | (SMALL if chosen["class_path"] == ACT_PATH else {})
-    if "prior" in path.stem:
-        options["refine"]["init_args"] = {"errors": [float(k) for k in range(50)]}
     return rebuild({"class_path": chosen["class_path"], "init_args": options})
 
 

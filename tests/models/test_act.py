@@ -11,7 +11,6 @@ from ugr_lightning.models.act import ACT
 from ugr_lightning.models.losses import refine_loss
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
-from ugr_lightning.models.refine.oracle import Oracle
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 from ugr_lightning.models.vision import FrozenBatchNorm2d
 
@@ -386,11 +385,6 @@ def test_policy_without_statistics_does_not_predict(tiny, batch):
 def test_heads_that_do_not_divide_the_width_are_refused(tiny):
     with pytest.raises(ConfigError, match="heads"):
         tiny(heads=3)
-
-
-def test_a_policy_that_would_need_the_true_errors_cannot_be_built(tiny):
-    with pytest.raises(ConfigError, match="offline"):
-        tiny(refine=Oracle(), uncertainty_head=True)
 
 
 def test_held_out_episodes_teach_the_uncertainty_and_the_others_everything_else(tiny, batch):

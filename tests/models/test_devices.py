@@ -20,7 +20,7 @@ def found():
 
 
 def test_every_policy_trains_and_acts_on_the_device_where_it_is(found):
-    assert {"base", "cmask", "full", "block", "uncert", "dp", "prior", "uncert_held_out", "demo"} <= found.keys()
+    assert {"base", "cmask", "full", "block", "uncert", "dp", "uncert_held_out", "demo"} <= found.keys()
     assert {name: error for name, error in found.items() if error and name != "stray"} == {}
 
 

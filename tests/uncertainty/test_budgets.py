@@ -53,7 +53,9 @@ def test_offline_errors_are_those_of_a_policy_with_that_budget(branch):
 
 def test_the_sweep_starts_at_coarse_ends_at_full_and_no_rule_beats_the_one_that_knows_the_gain():
     everything = predictions(with_refine_ratio(policy("mlp"), 1.0))
-    found = sweep(everything, everything.coarse, resamples=20)
+    worse_first = np.arange(float(K))[None, ::-1]
+    found = sweep(everything, worse_first, resamples=20)
+    assert found.error["prior"] == found.error["head"] != found.error["tail"]
     assert found.ratios == RATIOS
     for name, intervals in found.error.items():
         assert intervals[0].value == pytest.approx(everything.coarse.mean())

@@ -1,12 +1,7 @@
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
-import torch
 
-from ugr_lightning.contract import Chunk
-from ugr_lightning.models.transformer import Dropout
-from ugr_lightning.uncertainty.estimators import disagreement, dropout_on, estimator_table, sampled_deviation
+from ugr_lightning.uncertainty.estimators import disagreement, estimator_table
 from ugr_lightning.uncertainty.predictions import Predictions
 
 K, A = 6, 3
@@ -32,33 +27,6 @@ def test_disagreement_is_the_distance_to_what_earlier_chunks_said_of_the_same_mo
                 assert found[now, k] == pytest.approx(np.sqrt(np.mean(distances)))
     assert np.isnan(found[[0, 3]]).all()
     assert not np.isnan(found[2, :4]).any()
-
-
-def test_sampled_deviation_recovers_the_scatter_of_the_predictions_in_units_of_the_data():
-    std = torch.tensor([0.5, 1.0, 2.0])
-    frames = SimpleNamespace(of=lambda episodes, stride: np.arange(16))
-    part = SimpleNamespace(observation="seen")
-    data = SimpleNamespace(
-        data=SimpleNamespace(frames=frames, __getitems__=lambda rows: part), statistics=SimpleNamespace(action_std=std)
-    )
-    size = torch.linspace(0.1, 1, K)[:, None]
-    torch.manual_seed(0)
-
-    def draw(seen):
-        return Chunk(torch.randn(16, K, A) * size * std)
-
-    found = sampled_deviation(draw, data, (0,), stride=1, samples=400)
-    assert found.shape == (16, K)
-    assert np.allclose(found, np.sqrt(A) * size[:, 0].numpy(), rtol=0.15)
-
-
-def test_dropout_works_in_evaluation_mode_inside_the_context_only():
-    for trained_with, shares in ((0.0, (0.2, 0.3)), (0.5, (0.45, 0.55))):
-        net = torch.nn.Sequential(Dropout(trained_with)).eval()
-        x = torch.ones(100, 100)
-        with dropout_on(net, 0.25):
-            assert shares[0] < float((net(x) == 0).float().mean()) < shares[1]
-        assert torch.equal(net(x), x)
 
 
 def test_estimators_are_compared_with_s_on_the_steps_that_both_know():

@@ -37,7 +37,7 @@ def _analyze(
         after_end: count steps past the end of an episode (`hold`) or not (`mask`); null does as the training did.
         resamples: draws of the bootstrap over episodes.
         budgets: also the error when from none to all of the steps are refined, chosen by s_k and by its rivals.
-        estimators: also other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+        estimators: also another estimate of the uncertainty: overlapping chunks.
         residuals: also how much of the error on new scenes can be foretold from what a refinement branch sees.
         traces: folder that `ugr rollout --traces` filled; says whether s_k, or chunks that disagree, warned
             before episodes failed.
@@ -53,9 +53,8 @@ def _analyze(
     policy, info = load_policy(file)
     if budgets:
         with_refine_ratio(policy, 1.0)  # an error where the policy ranks no steps
-    for option, chosen in (("--estimators", estimators), ("--residuals", residuals)):
-        if chosen and not isinstance(policy, ACT):
-            raise ConfigError(option, "a policy of the class ACT", type(policy).__name__, "Leave it out.")
+    if residuals and not isinstance(policy, ACT):
+        raise ConfigError("--residuals", "a policy of the class ACT", type(policy).__name__, "Leave it out.")
     opened = open_own(policy, info, data, after_end)
     described = {"file": str(file), "sha256": info.sha256, "task": opened.task}
     study = kit.begin_study(policy, opened, described, stride=stride, resamples=resamples)

@@ -170,9 +170,6 @@ class ACT(TokenPolicy):
         )
         if dim % heads or dim % 4:
             raise ConfigError("dim", f"a multiple of heads ({heads}) and of 4", dim, "Change `dim` or `heads`.")
-        if refine is not None and refine.offline:
-            fix = "Compare with it offline: `ugr analyze --budgets`."
-            raise ConfigError("refine", "a rule that knows what a policy knows", type(refine).__name__, fix)
         wants_uncertainty = uncertainty_head or (refine is not None and refine.needs_uncertainty)
         if uncertainty_holdout and (uncertainty_holdout < 2 or not wants_uncertainty):
             fix = "Set it to 0, or to 5 for every fifth episode, with `uncertainty_head: true` if `refine` needs none."
@@ -245,12 +242,11 @@ class ACT(TokenPolicy):
         return self.lesson({"loss": total, **terms}, plan.sighting)
 
     @torch.no_grad()
-    def predict(self, observation: Observation, latent: Tensor | None = None) -> Chunk:
+    def predict(self, observation: Observation) -> Chunk:
         """The chunk to execute, with a latent of zero, in evaluation mode whatever mode the policy is in.
 
         Args:
             observation: what the robot sees now.
-            latent: (B, latent) another style of motion in place of zero, to study what the latent decides.
 
         Returns:
             The chunk, in robot units.
@@ -263,8 +259,7 @@ class ACT(TokenPolicy):
         self.require_finite_state(observation)
         with self.evaluation_mode():
             state, _ = self.disturb(self.normalizer.state(observation.state))  # (B, S)
-            if latent is None:
-                latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
+            latent = state.new_zeros(state.shape[0], self.latent_dim)  # (B, latent)
             whole = torch.ones(state.shape[0], self.chunk_length, dtype=torch.bool, device=state.device)
             plan = self._plan(observation, state, latent, whole)
             actions = self.robot_actions(plan.actions)  # (B, K, A)

@@ -9,8 +9,6 @@ import torch
 from ugr_lightning.contract import ChunkPolicy
 from ugr_lightning.models.refine.budget import with_refine_ratio
 from ugr_lightning.models.refine.head import Head
-from ugr_lightning.models.refine.oracle import Oracle
-from ugr_lightning.models.refine.prior import Prior
 from ugr_lightning.models.refine.ranked import Ranked
 from ugr_lightning.models.refine.scattered import Scattered
 from ugr_lightning.models.refine.tail import Tail
@@ -44,17 +42,16 @@ def selectors(ratio: float, prior: np.ndarray, everything: Predictions) -> dict[
         prior: (K,) mean error by position on the training episodes.
         everything: predictions with all steps refined.
     """
-    learned = everything.log_variance
+    learned, highest = everything.log_variance, Uncertainty(ratio)
     assert learned is not None
-    gain = everything.coarse - everything.executed  # (n, K)
     return {
-        "learned": (Uncertainty(ratio), learned),
-        "prior": (Prior(ratio, errors=prior.tolist()), learned),
+        "learned": (highest, learned),
+        "prior": (highest, np.broadcast_to(prior, learned.shape)),
         "scattered": (Scattered(ratio), learned),
         "head": (Head(ratio), learned),
         "tail": (Tail(ratio), learned),
-        "oracle": (Oracle(ratio), everything.coarse),
-        "gain": (Oracle(ratio), gain),
+        "oracle": (highest, everything.coarse),
+        "gain": (highest, everything.coarse - everything.executed),
     }
 
 

@@ -21,9 +21,8 @@ from ugr_lightning.rollout.traces import read_traces
 from ugr_lightning.system.files import publish, publish_text
 from ugr_lightning.uncertainty import calibration_report as report
 from ugr_lightning.uncertainty.budgets import sweep, sweep_figure, sweep_table
-from ugr_lightning.uncertainty.calibration import position_mean
 from ugr_lightning.uncertainty.calibration_figures import calibration_figure, event_figure
-from ugr_lightning.uncertainty.estimators import estimate, estimator_table
+from ugr_lightning.uncertainty.estimators import estimator_table, overlapping
 from ugr_lightning.uncertainty.events import KINDS, find_events
 from ugr_lightning.uncertainty.failure import Alarms, Score, detect_failures, overlap_score, uncertainty_score
 from ugr_lightning.uncertainty.foretold import foretold, foretold_table
@@ -64,11 +63,9 @@ class Study:
         return "\n\n".join([*map(as_text, self.tables), *self.sentences])
 
     def write(self, folder: Path) -> None:
-        """Write `analysis.json`, `analysis.md`, `prior.json` (for the selector `Prior`) and the figures."""
+        """Write `analysis.json`, `analysis.md` and the figures."""
         title = f"Uncertainty of {self.content['checkpoint']['file']}"
         write_page(folder, "analysis", title, self.sentences, self.tables, self.figures, self.content)
-        prior = json.dumps(plain_json(position_mean(self.training.coarse)))
-        publish_text(folder / "prior.json", prior + "\n")
 
 
 def write_page(
@@ -178,15 +175,17 @@ def add_budgets(study: Study) -> None:
 
 
 def add_estimators(study: Study) -> None:
-    """Add other estimates of the uncertainty: MC dropout, sampled latents, overlapping chunks.
+    """Add another estimate of the uncertainty: overlapping chunks.
 
     Raises:
-        ConfigError: the policy has no s_k to compare them with.
+        ConfigError: the policy has no s_k to compare it with, or its chunks do not overlap.
     """
     _require_uncertainty(study, "--estimators")
-    assert isinstance(study.policy, ACT)
-    estimates = estimate(study.policy, study.data, study.data.episode_split.validation, stride=study.stride)
-    table = estimator_table(study.validation, estimates, study.budget)
+    if study.stride >= study.policy.chunk_length:
+        expected = f"chunks of {study.policy.chunk_length} steps that overlap"
+        raise ConfigError("--estimators", expected, f"one every {study.stride} steps", "Lower --stride.")
+    overlap = overlapping(study.policy, study.data, study.data.episode_split.validation, stride=study.stride)
+    table = estimator_table(study.validation, {"overlapping chunks": overlap}, study.budget)
     study.content["estimators"] = table
     study.tables.append(table)
 

@@ -2,7 +2,6 @@
 
 import importlib
 import inspect
-import json
 import pkgutil
 from pathlib import Path
 
@@ -15,8 +14,6 @@ from ugr_lightning.models import refine
 from ugr_lightning.models.refine.block import Block
 from ugr_lightning.models.refine.full import Full
 from ugr_lightning.models.refine.head import Head
-from ugr_lightning.models.refine.oracle import Oracle
-from ugr_lightning.models.refine.prior import Prior
 from ugr_lightning.models.refine.scattered import Scattered
 from ugr_lightning.models.refine.selector import Selector, checked_budget
 from ugr_lightning.models.refine.tail import Tail
@@ -24,7 +21,6 @@ from ugr_lightning.models.refine.uncertainty import Uncertainty
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 STEPS = 50
-ARGUMENTS = {Prior: {"errors": [float(k % 7) for k in range(STEPS)]}}  # of those that have no defaults
 
 
 def discovered() -> list[type[Selector]]:
@@ -34,10 +30,6 @@ def discovered() -> list[type[Selector]]:
             if issubclass(item, Selector) and not inspect.isabstract(item) and item.__module__ == module.name:
                 found.append(item)
     return found
-
-
-def build(kind: type[Selector]) -> Selector:
-    return kind(**ARGUMENTS.get(kind, {}))
 
 
 every_selector = pytest.mark.parametrize("kind", discovered(), ids=lambda kind: kind.__name__)
@@ -52,24 +44,19 @@ def whole(batch: int = 6) -> torch.Tensor:
 
 
 def test_the_selectors_of_the_paper_and_the_controls_are_discovered():
-    assert {Full, Block, Uncertainty, Head, Tail, Scattered, Prior, Oracle} <= set(discovered())
+    assert {Full, Block, Uncertainty, Head, Tail, Scattered} <= set(discovered())
 
 
 @every_selector
-def test_has_a_yaml_that_trains_it_unless_no_policy_can_act_with_it(kind):
+def test_has_a_yaml_that_trains_it(kind):
     named = f"class_path: {kind.__module__}.{kind.__name__}\n"
-    configs = [path.name for path in CONFIGS.rglob("*.yaml") if named in path.read_text()]
-    assert bool(configs) != kind.offline, configs
-
-
-def test_the_oracle_alone_is_for_offline_comparisons():
-    assert [kind for kind in discovered() if kind.offline] == [Oracle]
+    assert any(named in path.read_text() for path in CONFIGS.rglob("*.yaml"))
 
 
 @every_selector
 @pytest.mark.parametrize("training", [False, True])
 def test_spends_exactly_its_budget_on_a_whole_chunk(kind, training):
-    selector = build(kind)
+    selector = kind()
     mask = selector.select(scores(), whole(), training)
     assert mask.shape == (6, STEPS)
     assert mask.dtype == torch.bool
@@ -83,12 +70,12 @@ def test_spends_exactly_its_budget_on_a_whole_chunk(kind, training):
 def test_never_chooses_a_padded_step(kind, training):
     valid = torch.arange(STEPS)[None] < torch.tensor([50, 40, 20, 14, 3, 1])[:, None]
     for _ in range(20):
-        assert not (build(kind).select(scores(), valid, training) & ~valid).any()
+        assert not (kind().select(scores(), valid, training) & ~valid).any()
 
 
 @every_selector
 def test_is_deterministic_at_run_time_and_leaves_the_random_state_alone(kind):
-    selector, state = build(kind), torch.get_rng_state()
+    selector, state = kind(), torch.get_rng_state()
     first = selector.select(scores(), whole(), False)
     assert torch.equal(state, torch.get_rng_state())
     assert torch.equal(first, selector.select(scores(), whole(), False))
@@ -96,7 +83,7 @@ def test_is_deterministic_at_run_time_and_leaves_the_random_state_alone(kind):
 
 @every_selector
 def test_chooses_for_each_sample_by_itself_at_run_time(kind):
-    selector = build(kind)
+    selector = kind()
     together = selector.select(scores(), whole(), False)
     alone = torch.cat([selector.select(s[None], whole(1), False) for s in scores()])
     assert torch.equal(together, alone)
@@ -105,32 +92,31 @@ def test_chooses_for_each_sample_by_itself_at_run_time(kind):
 @every_selector
 def test_does_not_change_its_inputs(kind):
     log_variance, valid = scores(), whole()
-    build(kind).select(log_variance, valid, True)
+    kind().select(log_variance, valid, True)
     assert torch.equal(log_variance, scores())
     assert torch.equal(valid, whole())
 
 
 @every_selector
 def test_works_without_log_variance_unless_it_says_it_needs_it(kind):
-    if kind.needs_uncertainty or kind.offline:
+    if kind.needs_uncertainty:
         with pytest.raises(ConfigError):
-            build(kind).select(None, whole(), False)
+            kind().select(None, whole(), False)
     else:
-        assert build(kind).select(None, whole(), False).shape == (6, STEPS)
+        assert kind().select(None, whole(), False).shape == (6, STEPS)
 
 
 @every_selector
 def test_is_rebuilt_from_its_blueprint(kind):
-    again = rebuild(build(kind).blueprint())
+    again = rebuild(kind().blueprint())
     assert type(again) is kind
-    assert torch.equal(again.select(scores(), whole(), False), build(kind).select(scores(), whole(), False))
+    assert torch.equal(again.select(scores(), whole(), False), kind().select(scores(), whole(), False))
 
 
 @every_selector
 @pytest.mark.parametrize("steps", [STEPS, 13])
-def test_keeps_its_promises_and_leaves_the_random_state_alone(kind, steps, monkeypatch):
-    monkeypatch.setitem(ARGUMENTS, Prior, {"errors": [float(k % 7) for k in range(steps)]})
-    selector, state = build(kind), torch.get_rng_state()
+def test_keeps_its_promises_and_leaves_the_random_state_alone(kind, steps):
+    selector, state = kind(), torch.get_rng_state()
     assert checked_budget(selector, steps, uncertain=True) == selector.budget(steps)
     assert torch.equal(state, torch.get_rng_state())
 
@@ -247,35 +233,3 @@ def test_scattered_draws_anew_for_each_sample_in_training_and_once_for_all_at_ru
     assert masks.float().mean(0).sub(0.3).abs().max() < 0.06  # every position is equally likely
     assert Scattered().select(None, whole(5), False).float().var(0).max() == 0
     assert chosen(Scattered(seed=0)) != chosen(Scattered(seed=1))
-
-
-def test_prior_chooses_the_positions_that_are_worst_on_average_and_remembers_them_without_its_file(tmp_path):
-    path = tmp_path / "prior.json"
-    path.write_text(json.dumps([float(k in range(10, 25)) for k in range(STEPS)]))
-    selector = Prior(file=str(path))
-    path.unlink()
-    again = rebuild(selector.blueprint())
-    assert chosen(selector) == chosen(again) == list(range(10, 25))
-    assert rebuild(again.blueprint()).errors == selector.errors
-
-
-@pytest.mark.parametrize("content", ["{}", "[1, null]", "not json", '["a"]'])
-def test_a_prior_that_is_no_list_of_numbers_is_refused(tmp_path, content):
-    path = tmp_path / "prior.json"
-    path.write_text(content)
-    with pytest.raises(ConfigError, match=r"prior\.json"):
-        Prior(file=str(path))
-
-
-def test_a_prior_without_errors_or_of_another_length_says_who_writes_one():
-    for build_wrong in (Prior, lambda: Prior(file="nowhere.json"), lambda: Prior(errors=[1.0, 2.0]).budget(50)):
-        with pytest.raises(ConfigError, match="ugr analyze"):
-            build_wrong()
-
-
-def test_the_oracle_chooses_the_largest_errors_and_refuses_to_act():
-    error = scores().abs()
-    mask = Oracle().select(error, whole(), False)
-    assert torch.equal(mask, Uncertainty().select(error, whole(), False))
-    with pytest.raises(ConfigError, match="nobody knows"):
-        Oracle().select(None, whole(), False)

@@ -21,8 +21,6 @@ class Selector(Blueprinted, ABC):
 
     needs_uncertainty: ClassVar[bool] = False
     """Whether the policy must predict a log-variance per step for this rule."""
-    offline: ClassVar[bool] = False
-    """Whether the rule wants the true errors in place of the log-variance: no policy can be built with it."""
 
     @abstractmethod
     def budget(self, chunk_length: int) -> int | None:
