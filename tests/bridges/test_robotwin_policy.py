@@ -4,6 +4,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from robotwin_environment import TaskEnv, evaluate, import_policy, read_settings
 from ugr_lightning.bridges import robotwin_policy as robotwin
 from ugr_lightning.bridges.deployment import scaled
 from ugr_lightning.bridges.export import export_policy
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import CheckpointError, ConfigError, NumericsError, ProtocolError
 from ugr_lightning.models.checkpoint import sha256
 from ugr_lightning.rollout.alarm import Alarm, write_alarms
@@ -118,6 +120,25 @@ def test_cameras_are_found_by_name_in_whatever_order_the_policy_wants_them(tmp_p
     assert robotwin.get_model(settings(overhead, cameras={"overhead": "head_camera"}))
     with pytest.raises(ConfigError, match="overhead"):
         robotwin.get_model(settings(overhead))
+
+
+def test_joints_and_cameras_that_the_training_picked_are_not_taken_for_those_of_the_environment(tmp_path):
+    swapped = Layout(state=(*range(7, 14), *range(7)))
+    picked = save(Reacher(), tmp_path / "a.ckpt", layout=asdict(swapped))
+    with pytest.raises(CheckpointError, match=r"`data.layout.state` picked.*`ignore_layout`"):
+        robotwin.get_model(settings(picked))
+    with pytest.raises(CheckpointError, match="ignore_layout"):
+        robotwin.write_policy(picked, tmp_path / "UGR")
+    assert robotwin.get_model(settings(picked, ignore_layout="true")), "only the files were in another order"
+    robotwin.write_policy(picked, tmp_path / "UGR", ignore_layout=True)
+    assert read_settings(tmp_path / "UGR")["ignore_layout"] is True
+    front = save(Reacher(), tmp_path / "b.ckpt", layout=asdict(Layout({"cam_high": "front_camera"})))
+    with pytest.raises(ConfigError, match=r"cam_high.*usual one is head_camera.*files had front_camera"):
+        robotwin.get_model(settings(front))
+    for name in ("front_camera", "head_camera"):
+        assert robotwin.get_model(settings(front, cameras={"cam_high": name})).deployment.cameras["cam_high"] == name
+    known = save(Reacher(), tmp_path / "c.ckpt", layout=asdict(Layout({"cam_high": "cam_head"})))
+    assert robotwin.get_model(settings(known)), "another project's word for the same camera"
 
 
 def test_strings_where_switches_and_numbers_are_meant_are_understood(reacher):

@@ -48,7 +48,7 @@ def test_data_with_a_folder_and_a_layout_of_their_own_are_found_again(ten_demons
     chosen = {"folder": str(place), "layout": Layout(state=joints)}
     untrained(TinyPolicy(cameras=CAMERAS, dim=3), tmp_path, chosen)
     _, info = load_policy(tmp_path / "policy_best.ckpt")
-    assert Layout.of(info.data["layout"]) == Layout(state=joints)
+    assert Layout.of_training(info.data) == Layout(state=joints)
     command = ["analyze", str(tmp_path / "policy_best.ckpt"), "--resamples", "5", "--data"]
     assert main([*command, str(place)]) == 0
     assert "do not tell of these events: close, open" in (tmp_path / "analysis-policy_best/analysis.md").read_text()

@@ -14,6 +14,7 @@ from tiny import TinyPolicy
 from ugr_lightning.cli.main import main
 from ugr_lightning.contract import CAMERAS, Observation
 from ugr_lightning.data.datamodule import ChunkDataModule
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.models.checkpoint import load_policy, save_policy
 from ugr_lightning.models.diffusion import DiffusionPolicy
 
@@ -137,3 +138,13 @@ def test_what_older_checkpoints_do_not_say_of_their_data_is_as_it_was_then(comma
 def test_numbers_that_make_no_sense_are_refused(command, capsys):
     assert main([*command, "--episodes", "0"]) == 2
     assert "episodes: expected a whole number above 0, got 0" in " ".join(capsys.readouterr().err.split())
+
+
+def test_commands_are_called_as_the_layout_picked_them(ten_demonstrations, tmp_path, untrained, capsys):
+    place = ten_demonstrations / "click_alarmclock" / "demo_clean"
+    picked = {"folder": str(place), "layout": Layout(state=("right_joint_2", 0))}
+    checkpoint = untrained(TinyPolicy(cameras=CAMERAS, dim=2), tmp_path, picked)
+    assert main(["predict", str(checkpoint), "--data", str(place), "--pictures", "1"]) == 0
+    said = capsys.readouterr().out
+    assert said.index("right joint 2") < said.index("left joint 1")
+    assert "left joint 2" not in said

@@ -7,6 +7,7 @@ import torch
 from PIL import Image
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import ConfigError
 from ugr_lightning.models.checkpoint import load_policy
 from ugr_lightning.results.results import read_results
@@ -273,3 +274,13 @@ def test_an_interrupted_test_says_how_the_other_episodes_are_run(world, checkpoi
     assert "interrupted by SIGTERM (`--resume` runs the other episodes)" in capsys.readouterr().err
     assert main(["rollout", str(checkpoint)]) == 143
     assert capsys.readouterr().err.strip().endswith("interrupted by SIGTERM"), "no file that could go on"
+
+
+def test_joints_that_the_training_picked_are_not_silently_taken_for_those_of_the_simulator(
+    world, untrained, ten_demonstrations, tiny_act, tmp_path
+):
+    place = ten_demonstrations / "click_alarmclock" / "demo_clean"
+    swapped = Layout(state=(*range(7, 14), *range(7)))
+    checkpoint = untrained(tiny_act(), tmp_path, {"folder": str(place), "layout": swapped})
+    with pytest.warns(UserWarning, match=r"`data.layout` picked.*robot of click_alarmclock, success says little"):
+        assert main(["test", str(checkpoint), "--episodes", "1", "--executions", "[aggregate]"]) == 0

@@ -3,10 +3,13 @@ import sys
 import numpy as np
 import pytest
 from made_up import episode
+from tiny import TinyPolicy
 
 from ugr_lightning.cli.main import main
 from ugr_lightning.cli.view import DISPLAYS
+from ugr_lightning.contract import CAMERAS
 from ugr_lightning.data.formats import detect
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.rollout.traces import write_trace
 from ugr_lightning.rollout.trajectory import EpisodeTrace
 from ugr_lightning.sim.frame import Frame
@@ -55,6 +58,20 @@ def test_predictions_are_shown_at_the_step_they_are_for(ten_demonstrations, untr
     assert found["/predicted/10_steps_before"][0] == [10, 11]
     assert "/predicted/25_steps_before" not in found
     assert found["/uncertainty"][0] == list(range(12))
+
+
+def test_curves_are_called_as_the_layout_of_the_training_picked_them(ten_demonstrations, untrained, tmp_path):
+    folder = ten_demonstrations / "click_alarmclock" / "demo_clean"
+    picked = {"folder": str(folder), "layout": Layout(state=(13, "left_joint_2"))}
+    checkpoint = untrained(TinyPolicy(cameras=CAMERAS, dim=2), tmp_path, picked)
+    out = tmp_path / "view.rrd"
+    assert main(["view", str(folder), "--checkpoint", str(checkpoint), "--out", str(out)]) == 0
+    names = [
+        part.to_record_batch().to_pydict()["SeriesLines:names"]
+        for part in chunk.RrdReader(out).stream().to_chunks()
+        if part.is_static and part.entity_path == "/joints/command"
+    ]
+    assert names == [[["right_gripper", "left_joint_2"]]]
 
 
 def test_a_rollout_is_shown_from_its_trace(tmp_path):

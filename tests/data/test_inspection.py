@@ -10,7 +10,7 @@ from recordings import arrays
 
 from ugr_lightning.data.folder import episode_path, write_seeds
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
-from ugr_lightning.data.inspection import column_names, inspect_demonstrations, measure_alignment
+from ugr_lightning.data.inspection import inspect_demonstrations, measure_alignment
 from ugr_lightning.data.layout import Joint, Layout
 from ugr_lightning.data.oddities import find_oddities, gripper_columns
 from ugr_lightning.data.storage.jpeg import encode_frame
@@ -106,13 +106,6 @@ def test_a_layout_and_chosen_cameras_are_what_is_looked_at(make):
     assert found.rows("state")[0] == pytest.approx(np.stack([smooth(0)[:-1, 8], 1 - smooth(0)[:-1, 13]], 1), abs=1e-6)
     with pytest.raises(ConfigError, match="cam_top"):
         inspect_demonstrations(make(0), cameras=("cam_top",))
-
-
-def test_names_of_columns_follow_the_layout():
-    names = ("a", "b", "c")
-    assert column_names(names, Layout(state=3), "state") == names
-    assert column_names((), Layout(state=3), "state") == ("0", "1", "2")
-    assert column_names(names, Layout(state=(2, "b", Joint(0))), "action") == ("c", "b", "a")
 
 
 def test_unreadable_episodes_are_told_beside_the_readable_ones(make):

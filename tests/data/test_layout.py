@@ -115,3 +115,16 @@ def test_a_layout_can_be_given_on_the_command_line():
     parsed = parser.parse_args([*words, "--data.layout.cameras={cam_high: top}", "--data.folder=elsewhere"])
     layout = parser.instantiate(parsed).data.layout
     assert layout == Layout({"cam_high": "top"}, (0, "elbow", Joint("grip", closed=0.0, open=0.04)), 3)
+
+
+def test_names_follow_what_is_picked():
+    names = ("a", "b", "c")
+    assert Layout(state=3).names(names, "state") == names
+    assert Layout(state=3).names((), "state") == ("0", "1", "2")
+    assert Layout(state=(2, "b", Joint(0))).names(names, "action") == ("c", "b", "a")
+
+
+def test_a_layout_is_plain_where_no_joint_is_picked():
+    assert Layout(cameras={"cam_high": "front"}, state=7).plain
+    assert not Layout(state=(0, 1)).plain
+    assert not Layout(action=(0, 1)).plain

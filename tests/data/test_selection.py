@@ -39,7 +39,7 @@ def test_what_is_not_there_is_named_with_what_is():
         Selection("push_*").choose(FOUND, WHERE)
     with pytest.raises(ConfigError, match=r"do not say their task.*folder of one task"):
         Selection("click_bell").choose(episodes(None, None), WHERE)
-    with pytest.raises(DataError, match=r"episodes 1, 9.*3 episodes, 0 to 5"):
+    with pytest.raises(DataError, match=r"episodes 1, 9.*3 episodes: 0, 3, 5"):
         Selection("click_bell", (0, 1, 9)).choose(FOUND, WHERE)
     for wrong in (0, -1, (), (1, 1)):
         with pytest.raises(ConfigError, match="episodes"):

@@ -4,7 +4,6 @@ import pytest
 from ugr_lightning.uncertainty.open_loop import (
     Errors,
     Followed,
-    command_names,
     compare_parts,
     conclusion,
     error_table,
@@ -34,15 +33,18 @@ def test_standing_still_is_left_out_where_states_are_no_commands():
     errors = compare_parts(followed([0.1, 0.1]), followed([0.1, 0.1], still=False), np.ones(2))
     assert errors.still is None
     assert errors.overall()[2] is None
-    table = error_table(errors)
+    table = error_table(errors, ("0", "1"))
     assert table[0] == ("command, in its own unit", "training", "validation", "deviation")
     assert all(len(row) == 4 for row in table)
     assert "standing still" not in conclusion(errors, (3, 3))
 
 
 def test_the_table_has_a_row_for_each_command_and_their_mean_last():
-    table = error_table(compare_parts(followed([0.5, 0.25]), followed([1.0, 0.5]), np.array([2.0, 0.5])))
+    table = error_table(
+        compare_parts(followed([0.5, 0.25]), followed([1.0, 0.5]), np.array([2.0, 0.5])), ("0", "left_gripper")
+    )
     assert table[1] == ("command 0", "0.5000", "1.0000", "1.0000", "2.0000")
+    assert table[2][0] == "left gripper"
     assert table[-1] == ("mean, in deviations", "0.375", "0.750", "1.250", "1")
 
 
@@ -60,9 +62,3 @@ def test_the_conclusion_tells_what_was_not_learned_from_what_was_learned_by_hear
     assert says in text
     assert f"On 10 training episodes the commands are off by {training:.3f} standard deviations" in text
     assert f"on 5 validation episodes by {validation:.3f}; standing still would be off by 1.000" in text
-
-
-def test_two_arms_have_names_and_others_numbers():
-    assert command_names(14)[:7] == [*(f"left joint {j}" for j in range(1, 7)), "left gripper"]
-    assert command_names(14)[13] == "right gripper"
-    assert command_names(3) == ["command 0", "command 1", "command 2"]

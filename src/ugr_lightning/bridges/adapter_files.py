@@ -54,6 +54,7 @@ def write_adapter_folder(
     *,
     execution: str | int = "aggregate",
     cameras: Mapping[str, str] | None = None,
+    ignore_layout: bool = False,
     copy: bool = False,
 ) -> list[Path]:
     """Write a policy folder for another program, after loading the checkpoint as that program will.
@@ -65,6 +66,8 @@ def write_adapter_folder(
         out: the folder, `policy/NAME` of a checkout of the other program.
         execution: see `Deployment`.
         cameras: the other program's names of the policy's cameras, where they differ from the usual ones.
+        ignore_layout: the other program has its joints in the policy's order and units, though the training picked
+            them from files that had not.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is now.
 
     Returns:
@@ -77,11 +80,13 @@ def write_adapter_folder(
     if not out.name.isidentifier():
         fix = "It is imported by its name; use e.g. policy/UGR."
         raise ConfigError("--out", "a folder named like a Python module", out.name, fix)
-    settings = {"checkpoint": str(checkpoint.resolve()), "execution": execution, "cameras": dict(cameras or {})}
+    settings: dict[str, Any] = {"checkpoint": str(checkpoint.resolve()), "execution": execution}
+    settings |= {"cameras": dict(cameras or {}), "ignore_layout": ignore_layout}
     used = load(settings).deployment.cameras
     named = "".join(f"\n  {json.dumps(ours)}: {json.dumps(name)}" for ours, name in used.items())
     place = out / (checkpoint.name if checkpoint.is_dir() else "policy_best.ckpt") if copy else checkpoint.resolve()
     values = {"POLICY": out.name, "EXECUTION": str(execution), "CAMERAS": named}
+    values["IGNORE_LAYOUT"] = json.dumps(ignore_layout)
     values["CHECKPOINT"] = json.dumps(place.name if copy else str(place))  # JSON is YAML, whatever a path holds
     written = _write_folder(template, out, values)
     if not copy or place.resolve() == checkpoint.resolve():

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from ugr_lightning.bridges.deployment import WHOLE_CHUNKS, Deployment
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.data.layout import OTHER_NAMES, Layout
+from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.rollout.aggregation import AGGREGATE, AGGREGATE_VARIANCE
 
 SWITCHES = {"true": True, "yes": True, "on": True, "1": True, "false": False, "no": False, "off": False, "0": False}
@@ -25,8 +26,8 @@ def deployment_of(
 
     Args:
         config: `execution`, and optionally `temporal_agg` (false without a number of steps means whole chunks, as in
-            ACT), `cameras`, `image_size`, `device`, `refine_ratio`. What its command line could not evaluate arrives as
-            strings, so "false" is false here and "25" a number.
+            ACT), `cameras`, `image_size`, `device`, `refine_ratio`, `ignore_layout`. What its command line could not
+            evaluate arrives as strings, so "false" is false here and "25" a number.
         checkpoint: the policy's file.
         cameras: the environment's usual names of our cameras, which those of the config override.
         calibration: see `Deployment`.
@@ -34,7 +35,7 @@ def deployment_of(
 
     Raises:
         ConfigError: a value that cannot work.
-        CheckpointError: not a usable checkpoint.
+        CheckpointError: not a usable checkpoint, or one whose training picked its joints from other ones.
 
     Source: RoboTwin-Platform/RoboTwin@13c3c47, script/eval_policy.py: `--key false` arrives as "false", which Python
         takes for true.
@@ -43,7 +44,7 @@ def deployment_of(
     if not isinstance(named, Mapping) or not all(isinstance(name, str) for name in named.values()):
         fix = "Write e.g. {cam_high: head_camera}."
         raise ConfigError("cameras", "the environment's name of each of the policy's cameras", named, fix)
-    return Deployment(
+    deployment = Deployment(
         checkpoint,
         cameras={**cameras, **named},
         calibration=calibration,
@@ -53,6 +54,20 @@ def deployment_of(
         device=text(config, "device", "auto"),
         refine_ratio=number(config, "refine_ratio"),
     )
+    layout = Layout.of_training(deployment.info.data)
+    if not layout.plain and not _switch(config, "ignore_layout"):
+        fix = (
+            "Where the environment has its joints in the policy's order and units, and only the files of the training "
+            "had not, say so with `ignore_layout`."
+        )
+        raise CheckpointError(checkpoint, "joints as the environment has them", layout.in_words(), fix)
+    for camera in set(deployment.cameras) & set(layout.cameras) - set(named):
+        theirs, usual = layout.cameras[camera], deployment.cameras[camera]
+        if theirs not in (camera, usual, *OTHER_NAMES.get(camera, ())):
+            fix = f"Say it with `cameras`, e.g. {{{camera}: {theirs}}}."
+            got = f"none; the usual one is {usual}, and the training's files had {theirs}"
+            raise ConfigError("cameras", f"the environment's name of {camera}", got, fix)
+    return deployment
 
 
 def text(config: Mapping[str, Any], key: str, default: str | None = None) -> str:

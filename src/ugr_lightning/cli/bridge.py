@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ugr_lightning.cli.parsing.call import call_one_of
 from ugr_lightning.cli.rollout import ExecutionName
@@ -18,6 +19,7 @@ def _robotwin(
     out: str = "policy/UGR",
     execution: ExecutionName = "aggregate",
     cameras: dict[str, str] | None = None,
+    ignore_layout: bool = False,
     copy: bool = False,
 ) -> int:
     """Write a policy folder for RoboTwin 2.0's branch `stable_2.0`; its `main` evaluates through `ugr bridge serve`.
@@ -29,13 +31,14 @@ def _robotwin(
         out: the folder; its name is the policy's. `policy/NAME` of a checkout of the branch `stable_2.0`.
         execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
         cameras: RoboTwin's names of the policy's cameras, where they are not the usual ones.
+        ignore_layout: its joints are in the policy's order and units, though `data.layout` of the training picked them
+            from files that had not.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is.
     """
     from ugr_lightning.bridges.robotwin_policy import write_policy
 
-    written = write_policy(
-        resolve_checkpoint(checkpoint, run, root), Path(out), execution=execution, cameras=cameras, copy=copy
-    )
+    given: dict[str, Any] = {"execution": execution, "cameras": cameras, "ignore_layout": ignore_layout, "copy": copy}
+    written = write_policy(resolve_checkpoint(checkpoint, run, root), Path(out), **given)
     print("\n".join(f"  {path}" for path in written))
     print("For RoboTwin's branch stable_2.0; its main has no policy folder and evaluates through `ugr bridge serve`.")
     print(f"In RoboTwin: bash policy/{Path(out).name}/eval.sh TASK demo_clean {Path(out).name} 0 0")
@@ -49,6 +52,7 @@ def _xpolicylab(
     out: str = "policy/UGR",
     execution: ExecutionName = "aggregate",
     cameras: dict[str, str] | None = None,
+    ignore_layout: bool = False,
     copy: bool = False,
 ) -> int:
     """Write an adapter folder for XPolicyLab's evaluation.
@@ -60,13 +64,14 @@ def _xpolicylab(
         out: the folder; its name is the policy's. `policy/NAME` of an XPolicyLab checkout.
         execution: `aggregate`; `aggregate-variance`; or the number of steps executed of each chunk.
         cameras: XPolicyLab's names of the policy's cameras, where they are not the usual ones.
+        ignore_layout: its joints are in the policy's order and units, though `data.layout` of the training picked them
+            from files that had not.
         copy: put the checkpoint into the folder; otherwise the folder points to where it is.
     """
     from ugr_lightning.bridges.xpolicylab.adapter import write_adapter
 
-    written = write_adapter(
-        resolve_checkpoint(checkpoint, run, root), Path(out), execution=execution, cameras=cameras, copy=copy
-    )
+    given: dict[str, Any] = {"execution": execution, "cameras": cameras, "ignore_layout": ignore_layout, "copy": copy}
+    written = write_adapter(resolve_checkpoint(checkpoint, run, root), Path(out), **given)
     print("\n".join(f"  {path}" for path in written))
     print(f"In XPolicyLab: bash policy/{Path(out).name}/eval.sh; its README has the arguments.")
     return 0

@@ -55,7 +55,7 @@ def _predict(
     std = opened.statistics.action_std.numpy()  # (A,)
     errors = kit.compare_parts(followed["training"], followed["validation"], std)
     says = kit.conclusion(errors, (len(parts["training"]), len(parts["validation"])))
-    table = kit.error_table(errors)
+    table = kit.error_table(errors, opened.command_names)
     figures = {
         f"{name}-{opened.demonstrations[episode].name}": kit.episode_figure(
             followed[name], opened, episode, f"{opened.demonstrations[episode].name}, {name}"

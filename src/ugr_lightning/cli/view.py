@@ -62,7 +62,8 @@ run = partial(call, _view, leading=["path"])
 
 def _write(place: Path, episode: int | None, checkpoint: Path | None, stride: int, out: Path) -> None:
     from ugr_lightning.data.formats import detect
-    from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
+    from ugr_lightning.data.layout import Layout
+    from ugr_lightning.data.selection import ranges
     from ugr_lightning.demos.timeline import predict_along, write_demonstration, write_rollout
     from ugr_lightning.models.checkpoint import load_policy
     from ugr_lightning.rollout.traces import read_traces
@@ -74,14 +75,14 @@ def _write(place: Path, episode: int | None, checkpoint: Path | None, stride: in
     locations = form.find(place)
     index = min(locations) if episode is None else episode
     if index not in locations:
-        got = f"{index}; there are {min(locations)} to {max(locations)}"
+        got = f"{index}; there are {ranges(locations)}"
         raise ConfigError("--episode", "one of the demonstrations", got, "Choose another.")
     contents = form.peek(locations[index])
     if checkpoint is None:
         demonstration = form.read(locations[index], contents.cameras, contents.layout)
         return write_demonstration(out, demonstration, contents.action)
     policy, info = load_policy(checkpoint)
-    layout = Layout.of(info.data["layout"]) if "layout" in info.data else DEFAULT_LAYOUT
+    layout = Layout.of_training(info.data)
     demonstration = form.read(locations[index], policy.cameras, layout)
     plans = predict_along(policy.for_inference(), demonstration, info.data, stride, place)
-    return write_demonstration(out, demonstration, contents.action, plans)
+    return write_demonstration(out, demonstration, layout.names(contents.action, "action"), plans)

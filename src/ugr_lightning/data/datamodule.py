@@ -192,6 +192,12 @@ class ChunkDataModule(lightning.LightningDataModule):
         rates = {episode.extras.get("control_hz") for episode in self.demonstrations}
         return rates.pop() if len(rates) == 1 else None
 
+    @property
+    def command_names(self) -> tuple[str, ...]:
+        """What the demonstrations call the policy's commands; positions in their vector as text without names."""
+        form, chosen, _ = self._chosen()
+        return self.layout.names(form.peek(next(iter(chosen.values()))).action, "action")
+
     def _chosen(self) -> tuple[EpisodeFormat, dict[int, EpisodeLocation], int]:
         """The format, the demonstrations that are used, and how many there are."""
         form, found = self._find()

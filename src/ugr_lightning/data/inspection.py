@@ -10,7 +10,7 @@ import numpy as np
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import Contents, EpisodeFormat, EpisodeLocation, detect
 from ugr_lightning.data.keyframes import keyframe_labels, missing_for_keyframes
-from ugr_lightning.data.layout import Joint, Layout, Vector
+from ugr_lightning.data.layout import Layout, Vector
 from ugr_lightning.data.pins import draw_pins
 from ugr_lightning.data.selection import ALL, Selection
 from ugr_lightning.data.storage.hdf5_frames import JpegFrames
@@ -131,7 +131,7 @@ def inspect_demonstrations(
         chosen = [chosen[place] for place in np.linspace(0, len(chosen) - 1, sampled).round().astype(int)]
     contents, failed = _peek(form, chosen)
     layout = layout or contents.layout
-    names = (column_names(contents.state, layout, "state"), column_names(contents.action, layout, "action"))
+    names = (layout.names(contents.state, "state"), layout.names(contents.action, "action"))
     found = Inspection(folder, form, contents, *names, present)
     kept = set(np.linspace(0, len(chosen) - 1, min(pictured, len(chosen))).astype(int).tolist())
     for number, (index, location) in enumerate(chosen, start=1):
@@ -160,21 +160,6 @@ def _peek(form: EpisodeFormat, chosen: Sequence[tuple[int, EpisodeLocation]]) ->
         got = ", ".join(f"{camera} ({what})" for camera, what in contents.others.items()) or "none"
         failed[index] = DataError(location.path, "a camera with colour pictures", got, "Record with pictures.")
     raise next(iter(failed.values()))
-
-
-def column_names(names: Sequence[str], layout: Layout, vector: Vector) -> tuple[str, ...]:
-    """What the columns of a policy's vector are called: as in the file, or as the layout picks them.
-
-    Args:
-        names: the file's.
-        layout: which of them the policy sees.
-        vector: of which of the two.
-    """
-    wanted = layout.state if vector == "state" or layout.action is None else layout.action
-    if isinstance(wanted, int):
-        return tuple(names) if len(names) == wanted else tuple(map(str, range(wanted)))
-    sources = [joint.source if isinstance(joint, Joint) else joint for joint in wanted]
-    return tuple(names[s] if isinstance(s, int) and s < len(names) else str(s) for s in sources)
 
 
 def _look(

@@ -81,8 +81,11 @@ class Layout:
                 raise ConfigError(f"data.layout.{name}", "at least one joint", 0, "Correct the number.")
 
     @classmethod
-    def of(cls, content: Mapping[str, Any]) -> "Layout":
-        """The layout that `dataclasses.asdict` turned into plain containers, as a checkpoint has it.
+    def of_training(cls, data: Mapping[str, Any]) -> "Layout":
+        """The layout that a policy was trained with.
+
+        Args:
+            data: what its checkpoint says of its data; without a layout the default one.
 
         Raises:
             ConfigError: something else, such as a layout of a later version.
@@ -93,6 +96,9 @@ class Layout:
                 return given
             return tuple(Joint(**joint) if isinstance(joint, Mapping) else joint for joint in given)
 
+        content = data.get("layout")
+        if content is None:
+            return cls()
         try:
             return cls(dict(content["cameras"]), joints(content["state"]), joints(content["action"]))
         except (KeyError, TypeError, ValueError) as error:
@@ -108,6 +114,29 @@ class Layout:
     def action_dim(self) -> int:
         """A, length of the policy's action."""
         return self.dim("action")
+
+    @property
+    def plain(self) -> bool:
+        """Whether the policy's vectors are the file's, all columns as they are."""
+        return isinstance(self.state, int) and (self.action is None or isinstance(self.action, int))
+
+    def names(self, columns: Sequence[str], vector: Vector) -> tuple[str, ...]:
+        """What the policy's numbers are called: as in the file, or as they are picked from it.
+
+        Args:
+            columns: names of the file's columns; empty where it does not say.
+            vector: of which of the two.
+        """
+        wanted = self._wanted(vector)
+        if isinstance(wanted, int):
+            return tuple(columns) if len(columns) == wanted else tuple(map(str, range(wanted)))
+        sources = [joint.source if isinstance(joint, Joint) else joint for joint in wanted]
+        return tuple(columns[s] if isinstance(s, int) and s < len(columns) else str(s) for s in sources)
+
+    def in_words(self) -> str:
+        """Which joints were picked, as an error says it."""
+        said = [f"`data.layout.{name}`" for name in ("state", "action") if isinstance(getattr(self, name), tuple)]
+        return f"those that {' and '.join(said) or 'no layout'} picked from the files of the training"
 
     def dim(self, vector: Vector) -> int:
         """Length of one of the policy's vectors."""

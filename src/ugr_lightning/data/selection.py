@@ -52,7 +52,7 @@ class Selection:
             return dict(list(chosen.items())[: self.episodes])
         missing = [number for number in self.episodes if number not in chosen]
         if missing:
-            got = f"{len(chosen)} episodes, {min(chosen)} to {max(chosen)}" if chosen else "none"
+            got = f"{len(chosen)} episodes: {ranges(chosen)}" if chosen else "none"
             raise DataError(where, f"the episodes {shorten(missing)}", got, "Correct the list of episodes.")
         return {number: chosen[number] for number in self.episodes}
 
@@ -86,6 +86,17 @@ def count_tasks(locations: Iterable[EpisodeLocation]) -> dict[str, int]:
 def describe_tasks(counts: Mapping[str, int]) -> str:
     """Tasks and their numbers of episodes in words."""
     return shorten([f"{task} ({count})" for task, count in counts.items()], SHOWN)
+
+
+def ranges(numbers: Iterable[int]) -> str:
+    """Whole numbers in words: those that follow each other as one range."""
+    runs: list[list[int]] = []
+    for number in sorted(numbers):
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1][1:] = [number]
+        else:
+            runs.append([number])
+    return shorten([" to ".join(map(str, run)) for run in runs])
 
 
 def shorten(values: Sequence[object], most: int = 8) -> str:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ugr_lightning.contract import ChunkPolicy
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.errors import CheckpointError, ConfigError
 from ugr_lightning.models.checkpoint import PolicyInfo
 from ugr_lightning.models.device import chosen_device
@@ -132,6 +133,12 @@ def checkpoint_actor(
     """
     require_fit(policy, task)
     name, data = type(policy).__name__, info.data
+    if not Layout.of_training(data).plain:
+        warnings.warn(
+            "`data.layout` picked the policy's joints from those of the files it was trained on: unless it gave them "
+            f"the order and units of the robot of {task}, success says little.",
+            stacklevel=2,
+        )
     if refine_ratio is not None:
         policy, name = with_refine_ratio(policy, refine_ratio), f"{name}(refine_ratio={refine_ratio:g})"
     return PolicyActor(

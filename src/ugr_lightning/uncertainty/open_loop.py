@@ -4,6 +4,7 @@ The first thing to look at with data of one's own. A policy that is wrong where 
 joints or times that do not belong together; one that is right there and wrong elsewhere needs more demonstrations.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -101,21 +102,17 @@ def compare_parts(training: Followed, validation: Followed, std: np.ndarray) -> 
     return Errors(training.joint_error(), validation.joint_error(), validation.still_error(), std)
 
 
-def command_names(dim: int) -> list[str]:
-    """Names of A commands: of two arms with a gripper each where there are 14, else their numbers."""
-    if dim != 14:
-        return [f"command {i}" for i in range(dim)]
-    return [
-        f"{side} {part}" for side in ("left", "right") for part in (*(f"joint {j}" for j in range(1, 7)), "gripper")
-    ]
+def error_table(errors: Errors, names: Sequence[str]) -> Cells:
+    """Errors by command, heading first, and their mean in standard deviations last.
 
-
-def error_table(errors: Errors) -> Cells:
-    """Errors by command, heading first, and their mean in standard deviations last."""
+    Args:
+        errors: of A commands.
+        names: of the commands, as the demonstrations have them.
+    """
     still = () if errors.still is None else ("standing still",)
     head = ("command, in its own unit", "training", "validation", *still, "deviation")
     columns = [column for column in errors if column is not None]
-    rows = zip(command_names(len(errors.std)), *columns, strict=True)
+    rows = zip(map(_called, names), *columns, strict=True)
     total = [f"{value:.3f}" for value in errors.overall() if value is not None]
     table: Cells = [head, *((name, *(f"{value:.4f}" for value in values)) for name, *values in rows)]
     return [*table, ("mean, in deviations", *total, "1")]
@@ -157,7 +154,7 @@ def episode_figure(followed: Followed, data: ChunkDataModule, episode: int, titl
 
     done = data.demonstrations[episode].action  # (T, A)
     rows = np.flatnonzero(followed.episode == episode)
-    names, std = command_names(done.shape[1]), data.statistics.action_std.numpy()
+    names, std = list(map(_called, data.command_names)), data.statistics.action_std.numpy()
     columns = (len(names) + 1) // 2
     figure = Figure(figsize=(2.4 * columns, 5), layout="constrained")
     axes = figure.subplots(2, columns, squeeze=False, sharex=True)
@@ -177,6 +174,11 @@ def episode_figure(followed: Followed, data: ChunkDataModule, episode: int, titl
     axes.flat[0].legend(fontsize=7)
     figure.suptitle(title, fontsize=9)
     return figure
+
+
+def _called(name: str) -> str:
+    """A column of a file that does not name it, by its position; others by their name."""
+    return f"command {name}" if name.isdigit() else name.replace("_", " ")
 
 
 def _mean(values: np.ndarray, valid: np.ndarray) -> np.ndarray:

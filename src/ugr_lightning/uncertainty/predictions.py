@@ -11,7 +11,7 @@ import torch
 from ugr_lightning.contract import Batch, ChunkPolicy
 from ugr_lightning.data.chunks import AfterEnd
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
+from ugr_lightning.data.layout import Layout
 from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.errors import DataError
 from ugr_lightning.models.checkpoint import TrainingData
@@ -135,7 +135,7 @@ def open_data(
         action_offset=trained.get("action_offset", 0),
         after_end=after_end or trained.get("after_end", "mask"),
         folder=root if own or trained.get("elsewhere") else None,
-        layout=Layout.of(trained["layout"]) if "layout" in trained else DEFAULT_LAYOUT,
+        layout=Layout.of_training(trained),
     )
     data.setup()
     if data.split != trained["split"] or not _trained_with(policy, data):
