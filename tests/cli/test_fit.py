@@ -213,6 +213,28 @@ def test_what_is_learned_by_may_change_on_the_way_and_is_said(tiny_config, capsy
     assert yaml.safe_load((RUN / "config.yaml").read_text())["run"] == "tiny"
 
 
+def test_the_settings_before_a_change_stay_beside_those_of_the_end(tiny_config):
+    fit(tiny_config, "--trainer.max_steps", "3", "--seed_everything", "4")
+    first = (RUN / "config.yaml").read_text()
+    again = ["--checkpoint", "last", "--seed_everything"]
+    fit(tiny_config, "--trainer.max_steps", "6", *again, "5")
+    assert (RUN / "config-to-step3.yaml").read_text() == first
+    assert yaml.safe_load((RUN / "config.yaml").read_text())["seed_everything"] == 5
+    fit(tiny_config, "--trainer.max_steps", "6", *again, "6")
+    assert yaml.safe_load((RUN / "config.yaml").read_text())["seed_everything"] == 5, "nothing was trained with 6"
+
+
+def test_the_same_episodes_in_other_words_are_no_others(tiny_config, capsys):
+    count = yaml.safe_load(Path(tiny_config).read_text())["data"]["episodes"]
+    fit(tiny_config, "--trainer.max_steps", "3")
+    more = ["--trainer.max_steps", "6", "--checkpoint", "last"]
+    assert main(["fit", "--config", tiny_config, *more, "--data.image_size", "[8,8]"]) == 2
+    assert "its weights know no other" in capsys.readouterr().err
+    assert main(["fit", "--config", tiny_config, *more, "--data.split_seed", "3"]) == 2
+    assert "what was validated before would be trained on" in " ".join(capsys.readouterr().err.split())
+    fit(tiny_config, *more, "--data.episodes", str(list(range(count))))
+
+
 @pytest.fixture
 def muon_config(tiny_config):
     """Config of a training with Muon, of a policy that has transformer layers."""

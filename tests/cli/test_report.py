@@ -1,3 +1,5 @@
+import json
+
 import pytest
 from made_up import episode
 
@@ -34,6 +36,22 @@ def test_a_report_can_be_made_again_of_the_summary_beside_it(files, tmp_path):
     assert main(["report", "first", "--out", "second"]) == 0
     for path in (tmp_path / "first").iterdir():
         assert path.read_text() == (tmp_path / "second" / path.name).read_text(), path.name
+
+
+def test_results_count_and_not_an_earlier_report_of_them(tmp_path, capsys):
+    run = tmp_path / "bench" / "results" / "base-reach-seed0"
+    run.mkdir(parents=True)
+    about = {"policy": "base", "task": "reach", "training_seed": 0, "config_sha256": "c", "checkpoint_sha256": "base"}
+    (run / "run.json").write_text(json.dumps(about))
+    assert main(["report", str(tmp_path / "bench")]) == 2
+    assert "expected episodes, got none" in " ".join(capsys.readouterr().err.split())
+    for seed in range(20):
+        append_result(run / "results.jsonl", episode(seed, seed < 7, checkpoint="base"))
+        if seed == 9:
+            assert main(["report", str(tmp_path / "bench"), "--out", str(tmp_path / "bench")]) == 0
+    capsys.readouterr()
+    assert main(["report", str(tmp_path / "bench")]) == 0
+    assert "7/20" in capsys.readouterr().out
 
 
 def test_results_at_home_are_found_and_a_damaged_config_beside_them_is_named(files, tmp_path, monkeypatch, capsys):

@@ -9,6 +9,8 @@ from deployed import looking_act, save
 from PIL import Image
 
 from ugr_lightning.cli.main import main
+from ugr_lightning.cli.parsing.data import open_own
+from ugr_lightning.data.split import Split
 from ugr_lightning.models.refine.head import Head
 from ugr_lightning.results.results import read_results
 from ugr_lightning.system.lock import locked
@@ -158,4 +160,16 @@ def test_two_sweeps_cannot_write_one_folder(command, world, tmp_path, capsys):
     with locked(tmp_path / "sweep-policy_best" / "sweep.lock", "test"):
         assert main([*command, "--data", "null"]) == 2
     assert "a folder that nobody else writes" in capsys.readouterr().err
+    assert world == []
+
+
+def test_one_validation_episode_is_too_few_for_the_offline_error(command, world, monkeypatch, capsys):
+    def opened(*given):
+        data = open_own(*given)
+        data.episode_split = Split((0, 1), (2,))
+        return data
+
+    monkeypatch.setattr("ugr_lightning.cli.sweep.open_own", opened)
+    assert main(command) == 2
+    assert "`--data null`" in capsys.readouterr().err
     assert world == []

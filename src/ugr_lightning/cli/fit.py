@@ -59,21 +59,31 @@ class RunRecord(SaveConfigCallback):
     """Leaves `config.yaml` in the run's folder, and its values beside the final scores in TensorBoard's HPARAMS.
 
     The file is written after the first step, not before: it says what the run's checkpoints are from. It starts the
-    same training anywhere, so its folders are absolute and it names no checkpoint to go on from.
+    same training anywhere, so its folders are absolute and it names no checkpoint to go on from. Where a training goes
+    on with other settings, those it had before stay in `config-to-stepN.yaml`.
     """
 
-    written = False
+    written, start = False, 0
 
     def setup(self, trainer: Trainer, pl_module: LightningModule, stage: str) -> None:
         """Nothing yet: whether the training can start is not known."""
+
+    def on_train_start(self, trainer: Trainer, pl_module: LightningModule) -> None:
+        """Remember where the training goes on."""
+        self.start = trainer.global_step
 
     def on_train_batch_end(self, trainer: Trainer, *_: Any) -> None:
         """Write the config, once."""
         if self.written:
             return
-        folder, self.written = Path(str(trainer.log_dir)), True
-        if trainer.is_global_zero:
-            publish_text(folder / self.config_filename, self.parser.dump(anywhere(self.config), skip_none=False))
+        path, self.written = Path(str(trainer.log_dir)) / self.config_filename, True
+        if not trainer.is_global_zero:
+            return
+        text = self.parser.dump(anywhere(self.config), skip_none=False)
+        kept = path.with_name(f"config-to-step{self.start}.yaml")
+        if path.is_file() and path.read_text() != text and not kept.exists():
+            publish_text(kept, path.read_text())
+        publish_text(path, text)
 
     def on_train_end(self, trainer: Trainer, pl_module: LightningModule) -> None:
         """Log the hyper-parameters with success as a metric, where there were rollouts."""

@@ -47,6 +47,8 @@ def _report(
                 "--runs", "NAME=FILE", text, "For example --runs base=runs/base/version_0/evaluation.jsonl"
             )
         evaluations.append(read_labelled(label, Path(path).expanduser()))
+    if not any(item.results for item in evaluations):
+        raise ConfigError("ugr report", "episodes", f"none in {', '.join(paths)}", "Let `ugr benchmark` end first.")
     report = build_report(evaluations, baseline=baseline)
     if out is None:
         print(to_markdown(report, title), end="")

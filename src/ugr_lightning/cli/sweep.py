@@ -10,7 +10,7 @@ from ugr_lightning.cli.parsing.call import Count, call
 from ugr_lightning.cli.parsing.data import OWN, open_own
 from ugr_lightning.cli.parsing.shard import every_nth, part_of
 from ugr_lightning.cli.rollout import ExecutionName, both_executions
-from ugr_lightning.errors import ConfigError
+from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.training.runs import resolve_checkpoint
 
@@ -208,6 +208,10 @@ def _offline(plan: SweepPlan, data: str, stride: int) -> list[Any]:
     from ugr_lightning.uncertainty.predictions import predict
 
     opened = open_own(plan.policy, plan.info, data)
+    known = len(opened.episode_split.validation)
+    if known < 2:
+        fix = "Leave the offline error out with `--data null`, or train on more demonstrations."
+        raise DataError("the checkpoint's split", "at least 2 validation episodes for the error's interval", known, fix)
     whole = with_refine_ratio(plan.policy, 1.0).for_inference()
     everything = predict(whole, opened, opened.episode_split.validation, stride=stride)
     return budget_errors(plan.policy, everything, [_share(plan, trial) for trial in plan.budgets])

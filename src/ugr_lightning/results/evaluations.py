@@ -84,6 +84,11 @@ class Evaluation:
     modes: dict[str, str] = field(default_factory=dict)
 
 
+def evaluated_runs(folder: Path) -> list[Path]:
+    """The folders of a benchmark's runs, or of a copy of its `results`; none where there is no benchmark."""
+    return sorted({path.parent for root in (folder, folder / "results") for path in root.glob(f"*/{RUN_FILE}")})
+
+
 def read_benchmark(folder: str | Path) -> list[Evaluation]:
     """The evaluations of a folder that `ugr benchmark` writes, or of a copy of its `results`, in the grid's order.
 
@@ -91,7 +96,7 @@ def read_benchmark(folder: str | Path) -> list[Evaluation]:
         DataError: there are none, or a file is damaged; names the file and the line.
     """
     folder = Path(folder)
-    found = sorted({path.parent for root in (folder, folder / "results") for path in root.glob(f"*/{RUN_FILE}")})
+    found = evaluated_runs(folder)
     if not found:
         fix = "Give a results folder of `ugr benchmark`, or single files with --runs NAME=FILE."
         raise DataError(folder, f"folders with {RUN_FILE}", "none", fix)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from ugr_lightning.errors import DataError
-from ugr_lightning.results.evaluations import Evaluation, read_benchmark
+from ugr_lightning.results.evaluations import Evaluation, evaluated_runs, read_benchmark
 from ugr_lightning.results.results import EpisodeResult
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.records import parse_json
@@ -19,11 +19,13 @@ TEXTS = ("policy", "task", "setting", "execution", "mode", "actor", "seeds_hash"
 def read_evaluations(folder: str | Path) -> list[Evaluation]:
     """The evaluations of a benchmark's folder, or of a report's folder with a summary.
 
+    A report may be written beside the results that it is of: these count then, not what they were that day.
+
     Raises:
         DataError: there are none, or a file is damaged; names the file and the line.
     """
     path = Path(folder) / SUMMARY_FILE
-    return read_summary(path) if path.is_file() else read_benchmark(folder)
+    return read_summary(path) if path.is_file() and not evaluated_runs(path.parent) else read_benchmark(folder)
 
 
 def write_summary(evaluations: Iterable[Evaluation], path: Path) -> None:

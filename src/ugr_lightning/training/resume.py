@@ -92,12 +92,17 @@ def check_data(path: Path, content: dict[str, Any], policy: ChunkPolicy, data: A
     pairs = {"cameras": (before.get("cameras"), now["cameras"])}
     pairs |= {f"data.{name}": (value, now["data"].get(name)) for name, value in before.get("data", {}).items()}
     changed = {key: pair for key, pair in pairs.items() if pair[0] is not None and pair[0] != pair[1]}
+    mixed = "data.split" in changed
+    if not mixed:
+        changed.pop("data.episodes", None)  # said in another way: they are the same
     kept = content.get(_ENTRY, {}).get("statistics")
     if not changed and kept is not None and not _same(kept, data.statistics):
         changed["the episodes"] = ("those of the checkpoint", "others with the same names (their joints differ)")
+        mixed = True
     if changed:
         expected, got = ("; ".join(f"{key} {_short(pair[side])}" for key, pair in changed.items()) for side in (0, 1))
-        fix = "Restore it, or train afresh without --checkpoint: what was validated before would be trained on."
+        why = "what was validated before would be trained on" if mixed else "its weights know no other"
+        fix = f"Restore it, or train afresh without --checkpoint: {why}."
         raise CheckpointError(path, f"what it was trained on ({expected})", got, fix)
 
 

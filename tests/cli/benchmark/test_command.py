@@ -155,7 +155,7 @@ def test_a_job_that_fails_costs_only_itself_and_is_reported(calls, monkeypatch, 
     assert "it went wrong in this way" in captured.out
     assert "ended with 3" in captured.err
     assert NAME in captured.err
-    assert "1 of 2 jobs are done" in captured.out
+    assert "1 of 2 jobs are done. Compare them:" in captured.out
     monkeypatch.delenv("FAIL")
     calls()
     assert go() == 0

@@ -159,7 +159,8 @@ class Benchmark:
         for name, why in failures.items():
             print(f"failed: {name}: {why.splitlines()[0]}", file=sys.stderr)
         done = len(self.jobs) - len(failures)
-        print(f"{done} of {len(self.jobs)} jobs are done. Compare them:  ugr report {self.folder}", flush=True)
+        compare = f" Compare them:  ugr report {self.folder}" if done else ""
+        print(f"{done} of {len(self.jobs)} jobs are done.{compare}", flush=True)
         return 1 if failures else 0
 
     def _run(self, job: Job, title: str, own: Lock) -> None:
