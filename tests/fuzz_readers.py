@@ -17,7 +17,7 @@ SAMPLES = {
     "robotwin": lambda folder: write_robotwin(folder, count=1),
     "act": lambda folder: write_act(folder, count=1),
     "act, compressed": lambda folder: write_act(folder, count=1, compress=True),
-    "maniskill": lambda folder: write_maniskill(folder, count=1),
+    "maniskill": lambda folder: write_maniskill(folder, lengths=(12,)),
     "lerobot": lambda folder: _lerobot(folder),
 }
 

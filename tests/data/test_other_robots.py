@@ -121,8 +121,8 @@ def test_what_maniskill_observed_beside_the_joints_can_be_part_of_the_state(tmp_
 
 
 def test_where_maniskills_replay_left_both_files_the_translated_one_is_read(tmp_path):
-    write_maniskill(tmp_path, "trajectory", mode="pd_ee_delta_pose", rgb=False)
-    write_maniskill(tmp_path, "trajectory.rgb.pd_joint_pos", count=3)
+    write_maniskill(tmp_path, "trajectory", mode="pd_ee_delta_pose", cameras=())
+    write_maniskill(tmp_path, "trajectory.rgb.pd_joint_pos", lengths=(12, 12, 12))
     form = detect(tmp_path)
     assert {place.path.name for place in form.find(tmp_path).values()} == {"trajectory.rgb.pd_joint_pos.h5"}
     assert len(inspect_demonstrations(tmp_path).seen) == 3

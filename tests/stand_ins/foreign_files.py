@@ -46,9 +46,9 @@ def jpeg_rows(jpegs):
 
 def write_act(
     folder, count=5, steps=14, width=14, cameras=ACT_CAMERAS, sizes=None, name="episode_{}.hdf5", compress=False,
-    dtype=np.float32, original=False,
+    dtype=np.float32, original=False, simulated=True,
 ):  # fmt: skip
-    """ACT's files; `sizes` by camera where not 24x32, `compress` as act-plus-plus does."""
+    """ACT's files; `sizes` by camera where not 24x32, `compress` as act-plus-plus does, `original` as its recorder."""
     folder.mkdir(parents=True, exist_ok=True)
     for episode in range(count):
         with h5py.File(folder / name.format(episode), "w") as file:
@@ -56,45 +56,63 @@ def write_act(
             joints = (100 * joints).astype(dtype) if np.dtype(dtype).kind == "i" else joints.astype(dtype)
             file["observations/qpos"], file["action"] = joints[:-1], joints[1:]
             if original:
-                file["observations/qvel"] = np.zeros((steps, width), np.float32)
+                file["observations/qvel"], file.attrs["sim"] = waves(steps, width, episode + 100), simulated
             for number, camera in enumerate(cameras):
                 shown = pictures(steps, (sizes or {}).get(camera, SIZE), 5 * episode + number)
-                file[f"observations/images/{camera}"] = jpeg_rows(list(map(swapped_jpeg, shown))) if compress else shown
+                rows = jpeg_rows(list(map(swapped_jpeg, shown))) if compress else shown
+                chunks = (1, *rows.shape[1:]) if original else None
+                file.create_dataset(f"observations/images/{camera}", data=rows, chunks=chunks)
             if compress:
                 file.attrs["compress"] = True
                 file["compress_len"] = np.full((len(cameras), steps), 1.0)
     return folder
 
 
-def write_robotwin(folder, count=5, steps=14, joints=6, cameras=ROBOTWIN_CAMERAS, sizes=None):
-    """RoboTwin's raw files of two arms."""
+def write_robotwin(folder, count=5, steps=14, joints=6, cameras=ROBOTWIN_CAMERAS, sizes=None, name="episode{}.hdf5"):
+    """RoboTwin's raw files of two arms, whose hands point down."""
     (folder / "data").mkdir(parents=True, exist_ok=True)
     for episode in range(count):
-        with h5py.File(folder / f"data/episode{episode}.hdf5", "w") as file:
+        with h5py.File(folder / "data" / name.format(episode), "w") as file:
             vector = waves(steps + 1, 2 * joints + 2, episode).astype(np.float64)
             for side, first in (("left", 0), ("right", joints + 1)):
                 file[f"joint_action/{side}_arm"] = vector[:, first : first + joints]
-                file[f"joint_action/{side}_gripper"] = vector[:, first + joints]
-            file["joint_action/vector"] = vector
+                file[f"joint_action/{side}_gripper"] = file[f"endpose/{side}_gripper"] = vector[:, first + joints]
+                pose = [0.1, 0.2, 1, 0.5**0.5, 0, 0.5**0.5, 0]
+                file[f"endpose/{side}_endpose"] = np.tile(pose, (steps + 1, 1))
+            file["joint_action/vector"], file["pointcloud"] = vector, np.zeros((steps + 1, 0))
             for number, camera in enumerate(cameras):
                 shown = pictures(steps + 1, (sizes or {}).get(camera, SIZE), 5 * episode + number)
                 file[f"observation/{camera}/rgb"] = np.array(list(map(swapped_jpeg, shown)), dtype=bytes)
+    (folder / "seed.txt").write_text(" ".join(str(4 + 5 * episode) for episode in range(count)))
     return folder
 
 
-def write_maniskill(folder, name="trajectory", count=4, steps=12, mode="pd_joint_pos", rgb=True):
-    """One file of ManiSkill's recorder: nine joints, eight commands, and what was observed beside them."""
+def write_maniskill(
+    folder, name="trajectory", lengths=(12, 12, 12, 12), mode="pd_joint_pos", width=8, qpos=9,
+    cameras=("base_camera",), skip=(),
+):  # fmt: skip
+    """One file of ManiSkill's recorder: trajectories of these many steps, and what was observed beside the joints."""
     folder.mkdir(parents=True, exist_ok=True)
+    episodes = []
     with h5py.File(folder / f"{name}.h5", "w") as file:
-        for episode in range(count):
-            group = file.create_group(f"traj_{episode}")
-            group["actions"], group["obs/agent/qpos"] = waves(steps, 8, episode), waves(steps + 1, 9, episode)
-            group["obs/extra/tcp_pose"] = waves(steps + 1, 7, episode + 1)
+        for number, steps in enumerate(lengths):
+            if number in skip:
+                continue
+            group = file.create_group(f"traj_{number}", track_order=True)
+            group["actions"] = waves(steps, width, 100 + number)
+            group["obs/agent/qpos"] = waves(steps + 1, qpos, number)
             group["obs/extra/is_grasped"] = np.arange(steps + 1) > 5
-            if rgb:
-                group["obs/sensor_data/base_camera/rgb"] = pictures(steps + 1, seed=episode)
-    entries = [{"episode_id": e, "episode_seed": e, "control_mode": mode, "elapsed_steps": steps} for e in range(count)]
-    (folder / f"{name}.json").write_text(json.dumps({"env_info": {"env_id": "Cube-v1"}, "episodes": entries}))
+            group["obs/extra/tcp_pose"] = waves(steps + 1, 7, number + 1)
+            for place, camera in enumerate(cameras):
+                shown, rgb = pictures(steps + 1, seed=5 * number + place), f"obs/sensor_data/{camera}/rgb"
+                group.create_dataset(rgb, data=shown, compression="gzip", compression_opts=5)
+            for flag in ("terminated", "truncated", "success"):
+                group[flag] = np.arange(steps) == steps - 1
+            group["rewards"] = np.zeros(steps, np.float32)
+            about = {"episode_id": number, "episode_seed": 40 + number, "control_mode": mode, "elapsed_steps": steps}
+            episodes.append(about | {"reset_kwargs": {"options": None, "seed": 40 + number}, "success": True})
+    info = {"env_id": "Press-v1", "env_kwargs": {"obs_mode": "rgb"}, "max_episode_steps": 50}
+    (folder / f"{name}.json").write_text(json.dumps({"env_info": info, "commit_info": None, "episodes": episodes}))
     return folder
 
 

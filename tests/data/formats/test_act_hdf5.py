@@ -13,24 +13,6 @@ from ugr_lightning.data.storage.hdf5_frames import RawFrames
 from ugr_lightning.errors import ConfigError, DataError
 
 
-def _original(path, steps=8, cameras=("top",), simulated=True):
-    """As the original's recorder: declared first, filled afterwards, frames in chunks of one."""
-    rng = np.random.default_rng(steps)
-    data = {name: rng.normal(size=(steps, 14)) for name in ("action", "observations/qpos", "observations/qvel")}
-    with h5py.File(path, "w", rdcc_nbytes=1024**2 * 2) as file:
-        file.attrs["sim"] = simulated
-        images = file.create_group("observations").create_group("images")
-        for camera in cameras:
-            images.create_dataset(camera, (steps, 24, 32, 3), dtype="uint8", chunks=(1, 24, 32, 3))
-        for name in data:
-            file.create_dataset(name, (steps, 14), "f4")
-        for name, array in data.items():
-            file[name][...] = array
-        for view, camera in enumerate(cameras):
-            file[f"observations/images/{camera}"][...] = pictures(steps, seed=view)
-    return data
-
-
 def _read(path, wanted, **layout):
     return detect(path.parent).read(EpisodeLocation(path), wanted, Layout(**layout))
 
@@ -74,17 +56,17 @@ def test_xpolicylabs_copies_of_the_format_call_the_head_camera_otherwise(tmp_pat
 
 @pytest.mark.parametrize("simulated", [True, False])
 def test_an_original_episode_is_read_with_the_command_of_its_own_row_as_label(simulated, tmp_path):
-    data = _original(tmp_path / "episode_3.hdf5", simulated=simulated)
+    write_act(tmp_path, 1, 8, cameras=("top",), name="episode_3.hdf5", original=True, simulated=simulated)
     form = detect(tmp_path)
     assert form.name == "original-act"
     assert list(form.find(tmp_path)) == [3]
     assert form.peek(form.find(tmp_path)[3]).cameras == ("top",)
     episode = _read(tmp_path / "episode_3.hdf5", ("top",))
     assert (episode.length, episode.cameras, episode.extras["sim"]) == (8, ("top",), simulated)
-    assert np.array_equal(episode.action, data["action"].astype(np.float32))
-    assert np.array_equal(episode.state, data["observations/qpos"].astype(np.float32))
+    assert np.array_equal(episode.action, waves(9, 14)[1:])
+    assert np.array_equal(episode.state, waves(9, 14)[:-1])
     assert np.array_equal(episode.measured, episode.state)
-    assert np.array_equal(episode.extras["qvel"], data["observations/qvel"].astype(np.float32))
+    assert np.array_equal(episode.extras["qvel"], waves(8, 14, 100))
     assert np.array_equal(episode.images(7)[0], pictures(8)[7])
     renamed = _read(tmp_path / "episode_3.hdf5", ("cam_high",), cameras={"cam_high": "top"})
     assert np.array_equal(renamed.images(7), episode.images(7))
@@ -145,8 +127,7 @@ def test_a_processed_file_of_others_converted_to_a_recording_keeps_joints_to_the
 
 
 def test_an_original_file_goes_round_without_loss(tmp_path):
-    (tmp_path / "a").mkdir()
-    _original(tmp_path / "a" / "episode_0.hdf5")
+    write_act(tmp_path / "a", 1, 8, cameras=("top",), original=True)
     given = _read(tmp_path / "a" / "episode_0.hdf5", ("top",))
     find_format("original-act").write(tmp_path / "b", [given])
     with h5py.File(tmp_path / "a" / "episode_0.hdf5") as one, h5py.File(tmp_path / "b" / "episode_0.hdf5") as two:

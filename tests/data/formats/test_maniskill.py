@@ -1,11 +1,9 @@
 """Samples are written here with the keys, types and compression of ManiSkill's wrapper; one test uses the wrapper."""
 
-import json
-
 import h5py
 import numpy as np
 import pytest
-from foreign_files import poke, replace
+from foreign_files import pictures, poke, replace, waves, write_maniskill
 
 from ugr_lightning.data.formats import detect
 from ugr_lightning.data.formats.maniskill import ManiSkill
@@ -17,43 +15,14 @@ FORMAT = ManiSkill()
 SIZE = (24, 32)
 
 
-def colour(camera, step):
-    return 200 - 10 * step, 40 + 50 * CAMERAS.index(camera), 20 + 5 * step
-
-
-def joints(steps, width=14, seed=0):
-    return np.random.default_rng(seed).normal(size=(steps, width)).astype(np.float32)
-
-
-def write(path, lengths=(5, 3, 7), mode="pd_joint_pos", width=14, qpos=14, pictures=True, skip=()):
-    """Trajectories of these many steps; observations have one more."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    episodes = []
-    with h5py.File(path, "w") as file:
-        for number, steps in enumerate(lengths):
-            if number in skip:
-                continue
-            group = file.create_group(f"traj_{number}", track_order=True)
-            group["obs/agent/qpos"] = joints(steps + 1, qpos, number)
-            for camera in CAMERAS if pictures else ():
-                frames = [np.full((*SIZE, 3), colour(camera, step), np.uint8) for step in range(steps + 1)]
-                rgb = f"obs/sensor_data/{camera}/rgb"
-                group.create_dataset(rgb, data=np.stack(frames), compression="gzip", compression_opts=5)
-            group["actions"] = joints(steps, width, 100 + number)
-            for name in ("terminated", "truncated", "success"):
-                group.create_dataset(name, data=np.arange(steps) == steps - 1, dtype=bool)
-            group["rewards"] = np.zeros(steps, np.float32)
-            about = {"episode_id": number, "episode_seed": 40 + number, "control_mode": mode, "elapsed_steps": steps}
-            episodes.append(about | {"reset_kwargs": {"options": None, "seed": 40 + number}, "success": True})
-    info = {"env_id": "Press-v1", "env_kwargs": {"obs_mode": "rgb"}, "max_episode_steps": 50}
-    path.with_suffix(".json").write_text(json.dumps({"env_info": info, "commit_info": None, "episodes": episodes}))
-    return path
+def write(folder, name="trajectory", lengths=(5, 3, 7), **more):
+    """Trajectories of a robot like ours."""
+    return write_maniskill(folder, name, lengths, **{"width": 14, "qpos": 14, "cameras": CAMERAS} | more)
 
 
 @pytest.fixture
 def recording(tmp_path):
-    write(tmp_path / "trajectory.h5")
-    return tmp_path
+    return write(tmp_path)
 
 
 def read(folder, index=0, cameras=CAMERAS, **layout):
@@ -61,8 +30,8 @@ def read(folder, index=0, cameras=CAMERAS, **layout):
 
 
 def test_trajectories_of_a_file_keep_their_numbers_and_seeds(tmp_path):
-    path = write(tmp_path / "20261122_101500.h5", lengths=(2,) * 12, skip={1, 5})
-    for place in (tmp_path, path):
+    write(tmp_path, "20261122_101500", (2,) * 12, skip={1, 5})
+    for place in (tmp_path, tmp_path / "20261122_101500.h5"):
         assert detect(place).name == "maniskill"
         found = FORMAT.find(place)
         assert list(found) == [0, 2, 3, 4, 6, 7, 8, 9, 10, 11]
@@ -71,16 +40,16 @@ def test_trajectories_of_a_file_keep_their_numbers_and_seeds(tmp_path):
 
 
 def test_trajectories_of_several_files_are_counted_through(tmp_path):
-    write(tmp_path / "b.h5", lengths=(4, 5))
-    write(tmp_path / "a.h5", lengths=(2, 3))
+    write(tmp_path, "b", (4, 5))
+    write(tmp_path, "a", (2, 3))
     found = FORMAT.find(tmp_path)
     assert [FORMAT.read(found[index], CAMERAS).length for index in range(4)] == [2, 3, 4, 5]
 
 
 def test_action_of_a_step_follows_its_observation_and_the_last_observation_is_dropped(recording):
     episode = read(recording, 2)
-    np.testing.assert_array_equal(episode.state, joints(8, seed=2)[:7])
-    np.testing.assert_array_equal(episode.action, joints(7, seed=102))
+    np.testing.assert_array_equal(episode.state, waves(8, 14, 2)[:7])
+    np.testing.assert_array_equal(episode.action, waves(7, 14, 102))
     np.testing.assert_array_equal(episode.proprioception("measured"), episode.state)
     assert (episode.length, episode.seed) == (7, 42)
     assert (episode.extras["control_mode"], episode.extras["environment"]) == ("pd_joint_pos", "Press-v1")
@@ -91,29 +60,30 @@ def test_colours_are_right_to_the_bit_in_the_order_asked_for(recording):
     cameras = ("cam_left_wrist", "cam_high")
     episode = read(recording, 2, cameras)
     for step in range(7):
-        assert [tuple(picture[3, 4]) for picture in episode.images(step)] == [colour(c, step) for c in cameras]
+        shown = [pictures(8, seed=10 + CAMERAS.index(camera))[step] for camera in cameras]
+        np.testing.assert_array_equal(episode.images(step), shown)
 
 
 def test_another_robot_is_read_through_a_layout(tmp_path):
-    write(tmp_path / "trajectory.h5", width=8, qpos=9)
+    write(tmp_path, width=8, qpos=9)
     with pytest.raises(DataError, match=r"qpos.*14.*\(5, 9\).*--data.layout.state 9"):
         read(tmp_path)
     contents = FORMAT.peek(FORMAT.find(tmp_path)[0])
     assert (set(contents.cameras), len(contents.state), len(contents.action)) == (set(CAMERAS), 9, 8)
     layout = Layout(cameras={"top": "cam_high"}, state=9, action=(0, Joint(7, closed=-1, open=1)))
     episode = FORMAT.read(FORMAT.find(tmp_path)[0], ("top",), layout)
-    np.testing.assert_allclose(episode.action[:, 1], (joints(5, 8, 100)[:, 7] + 1) / 2, atol=1e-6)
+    np.testing.assert_allclose(episode.action[:, 1], (waves(5, 8, 100)[:, 7] + 1) / 2, atol=1e-6)
 
 
 @pytest.mark.parametrize("mode", ["pd_ee_delta_pose", "pd_joint_delta_pos", None])
 def test_actions_that_are_no_absolute_joint_targets_are_refused(mode, tmp_path):
-    write(tmp_path / "trajectory.h5", mode=mode)
+    write(tmp_path, mode=mode)
     with pytest.raises(DataError, match=rf"pd_joint_pos.*got {mode!r}.*replay_trajectory.*-c pd_joint_pos"):
         read(tmp_path)
 
 
 def test_trajectories_without_pictures_say_how_to_get_them(tmp_path):
-    path = write(tmp_path / "trajectory.h5", pictures=False)
+    path = write(tmp_path, cameras=()) / "trajectory.h5"
     for case in ("joints only", "a flat state", "nothing"):
         with h5py.File(path, "r+") as file:
             if case != "joints only":
@@ -127,15 +97,15 @@ def test_trajectories_without_pictures_say_how_to_get_them(tmp_path):
 
 def several_robots(file):
     del file["traj_0/actions"]
-    file["traj_0/actions/left"] = joints(5)
+    file["traj_0/actions/left"] = waves(5, 14)
 
 
 RGB = "traj_0/obs/sensor_data/cam_high/rgb"
 HOSTILE = {
     "actions of several robots": (several_robots, "an array, got a group"),
-    "fewer actions than the JSON says": (replace("traj_0/actions", data=joints(4)), r"5 rows.*got 4"),
-    "no actions": (replace("traj_0/actions", data=joints(0)), r"5 rows.*got 0"),
-    "as many joints as actions": (replace("traj_0/obs/agent/qpos", data=joints(5)), r"qpos.*\(6, D\).*\(5, 14\)"),
+    "fewer actions than the JSON says": (replace("traj_0/actions", data=waves(4, 14)), r"5 rows.*got 4"),
+    "no actions": (replace("traj_0/actions", data=waves(0, 14)), r"5 rows.*got 0"),
+    "as many joints as actions": (replace("traj_0/obs/agent/qpos", data=waves(5, 14)), r"qpos.*\(6, D\).*\(5, 14\)"),
     "NaN": (poke("traj_0/actions", (1, 2), np.nan), r"actions.*nan at \[1, 2\]"),
     "fewer pictures": (replace(RGB, data=np.zeros((5, *SIZE, 3), np.uint8)), r"cam_high/rgb.*6 pictures"),
     "depth for colour": (replace(RGB, data=np.zeros((6, *SIZE, 1), np.uint16)), r"cam_high/rgb.*colour.*choose"),
@@ -182,7 +152,7 @@ def test_missing_metadata_are_a_clear_error(recording):
 
 def test_foreign_and_damaged_files_are_not_recognised(tmp_path):
     assert not FORMAT.recognises(tmp_path / "nowhere")
-    good = write(tmp_path / "good" / "a.h5").read_bytes()
+    good = (write(tmp_path / "good") / "trajectory.h5").read_bytes()
     (tmp_path / "a.h5").write_bytes(good[:2000])
     (tmp_path / "b.h5").write_bytes(b"text")
     with h5py.File(tmp_path / "c.h5", "w") as file:

@@ -6,7 +6,7 @@ import io
 import h5py
 import numpy as np
 import pytest
-from foreign_files import marked_jpeg, poke, replace, swapped_jpeg
+from foreign_files import ROBOTWIN_CAMERAS, marked_jpeg, pictures, poke, replace, waves, write_robotwin
 from PIL import Image
 from recordings import arrays
 
@@ -272,58 +272,36 @@ def test_overwritten_bytes_never_give_anything_but_a_data_error(episode_file):
     assert set(outcomes) == {"refused", "unharmed"}
 
 
-def _theirs(folder, spelling, frames=6, arm=6, count=3):
-    """As RoboTwin's own collector leaves it: a true RGB array handed to an encoder that takes it for BGR."""
-    for index in range(count):
-        vector = np.random.default_rng(index).normal(size=(frames, 2 * arm + 2))
-        path = folder / "data" / spelling.format(i=index)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with h5py.File(path, "w") as file:
-            for side, start in (("left", 0), ("right", arm + 1)):
-                file[f"joint_action/{side}_arm"] = vector[:, start : start + arm]
-                file[f"joint_action/{side}_gripper"] = vector[:, start + arm]
-                file[f"endpose/{side}_endpose"] = np.tile([0.1, 0.2, 1, 0.5**0.5, 0, 0.5**0.5, 0], (frames, 1))
-                file[f"endpose/{side}_gripper"] = vector[:, start + arm]
-            file["joint_action/vector"] = vector
-            for view, camera in enumerate(("front_camera", "head_camera", "left_camera", "right_camera")):
-                colours = np.array([(200, 20 * frame, 60 * view) for frame in range(frames)], np.uint8)
-                shown = np.tile(colours[:, None, None], (1, 24, 32, 1))  # (frames, H, W, 3)
-                file[f"observation/{camera}/rgb"] = np.array(list(map(swapped_jpeg, shown)), dtype=bytes)
-            file["pointcloud"] = np.zeros((frames, 0))
-    (folder / "seed.txt").write_text("4 9 11")
-    return folder
-
-
 def test_robotwins_tool_poses_are_moved_from_the_flange_to_the_fingers(tmp_path):
     """Its hands point down here."""
-    (path, *_) = sorted(_theirs(tmp_path, "episode{i}.hdf5").rglob("*.hdf5"))
-    episode = read_episode(path)
+    episode = read_episode(write_robotwin(tmp_path, 1) / "data" / "episode0.hdf5")
     assert episode.endpose[3, 1, :3] == pytest.approx([0.1, 0.2, 0.88], abs=1e-6)
     assert episode.extras["table_height"] == 0.74
 
 
-@pytest.mark.parametrize("spelling", ["episode{i}.hdf5", "episode_{i}.hdf5", "episode_{i:07d}.hdf5"])
+@pytest.mark.parametrize("spelling", ["episode{}.hdf5", "episode_{}.hdf5", "episode_{:07d}.hdf5"])
 def test_robotwins_own_episodes_are_read_under_all_their_spellings(spelling, tmp_path):
-    form = detect(_theirs(tmp_path, spelling))
+    seen = {camera: seed for seed, camera in enumerate(("front_camera", *CAMERAS), start=5)}
+    cameras = ("front_camera", *ROBOTWIN_CAMERAS)
+    form = detect(write_robotwin(tmp_path, 3, 5, cameras=cameras, name=spelling))
     assert form.name == "robotwin"
     found = form.find(tmp_path)
     assert list(found) == [0, 1, 2]
     assert form.peek(found[1]).cameras == (*CAMERAS, "front_camera")
-    vector = np.random.default_rng(1).normal(size=(6, 14)).astype(np.float32)
+    vector = waves(6, 14, 1)
     episode = form.read(found[1], (*CAMERAS, "front_camera"))
     assert (episode.length, episode.seed, episode.measured) == (5, 9, None)
     assert np.array_equal(episode.state, vector[:-1])
     assert np.array_equal(episode.action, vector[1:])
     for step in (0, 4):
-        blue = [picture[12, 16, 2] for picture in episode.images(step).astype(int)]
-        assert blue == pytest.approx([60, 180, 120, 0], abs=4)  # head, right, left, front
-        assert episode.images(step)[0, 12, 16, :2].astype(int).tolist() == pytest.approx([200, 20 * step], abs=4)
+        for camera, picture in zip(episode.cameras, episode.images(step).astype(int), strict=True):
+            assert np.median(np.abs(picture - pictures(6, seed=seen[camera])[step])) < 4
 
 
 def test_seven_joints_per_arm_are_named_and_picked(tmp_path):
-    form = detect(_theirs(tmp_path, "episode{i}.hdf5", arm=7))
+    form = detect(write_robotwin(tmp_path, 1, 5, joints=7))
     location = form.find(tmp_path)[0]
-    vector = np.random.default_rng(0).normal(size=(6, 16)).astype(np.float32)
+    vector = waves(6, 16)
     names = form.peek(location).state
     assert (len(names), names[6:9]) == (16, ("left_joint_7", "left_gripper", "right_joint_1"))
     with pytest.raises(DataError, match=r"\(T, 14\).*\(5, 16\).*--data.layout.state 16") as caught:
@@ -339,7 +317,7 @@ def test_seven_joints_per_arm_are_named_and_picked(tmp_path):
 
 @pytest.mark.parametrize("arm", [1.0, np.zeros((6, 10**4)), np.zeros(6)])
 def test_arms_that_do_not_fit_the_vector_only_cost_the_names(arm, tmp_path):
-    form = detect(_theirs(tmp_path, "episode{i}.hdf5"))
+    form = detect(write_robotwin(tmp_path, 1, 5))
     location = form.find(tmp_path)[0]
     with h5py.File(location.path, "r+") as file:
         replace("joint_action/left_arm", data=arm)(file)
