@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -74,6 +75,10 @@ class Hidden(Blueprinted):
 
     def __init__(self, weights: str | None = None) -> None:
         self.weights = weights
+
+
+class Retired(Anything):
+    retired: ClassVar = {"kind": "mlp"}
 
 
 class HiddenWithFewer(Hidden):
@@ -160,6 +165,15 @@ def test_an_argument_that_this_version_does_not_have_is_named():
     blueprint = Whole(vision=Vision()).blueprint()
     blueprint["init_args"]["vision"]["new"] = 1
     with pytest.raises(CheckpointError, match="new"):
+        rebuild(blueprint)
+
+
+def test_an_argument_that_is_gone_is_dropped_where_its_value_is_what_is_done_now():
+    blueprint = Retired(1).blueprint()
+    blueprint["init_args"]["kind"] = "mlp"
+    assert rebuild(blueprint).value == 1
+    blueprint["init_args"]["kind"] = "decoder"
+    with pytest.raises(CheckpointError, match=r"Retired\.kind: expected mlp, got decoder\. .*no longer in the code"):
         rebuild(blueprint)
 
 

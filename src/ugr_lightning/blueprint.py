@@ -4,7 +4,7 @@ import functools
 import importlib
 import inspect
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
 from numbers import Integral, Real
@@ -24,6 +24,8 @@ class Blueprinted:
 
     not_kept: ClassVar[tuple[str, ...]] = ()
     """Arguments that are recorded as null, because the object's weights replace what they name."""
+    retired: ClassVar[Mapping[str, object]] = {}
+    """Arguments that the class no longer has, in blueprints of before, with the values that are now always meant."""
     _blueprint: dict[str, Any]
 
     def __init_subclass__(cls, **kwargs: Any) -> None:
@@ -125,6 +127,7 @@ def rebuild(blueprint: dict[str, Any]) -> Any:
     hints = _hints(found)
     try:
         given = {name: _revive(value, hints.get(name)) for name, value in blueprint.get("init_args", {}).items()}
+        _drop_retired(found, given)
         _check_arguments(found, given)
         return found(**given)
     except (UGRError, MemoryError):  # neither says anything about the arguments
@@ -133,6 +136,15 @@ def rebuild(blueprint: dict[str, Any]) -> Any:
         fix = "The class has changed since, or the checkpoint is damaged."
         got = f"{type(error).__name__}: {error}"
         raise CheckpointError("init_args", f"arguments that {path} can be built with", got, fix) from error
+
+
+def _drop_retired(kind: type[Blueprinted], given: dict[str, Any]) -> None:
+    """Take away what an older version of a class was given, where it asks for nothing else than is done now."""
+    for name, value in kind.retired.items():
+        got = given.pop(name, value)
+        if got != value:
+            fix = "What it asks for is no longer in the code: use the version that wrote the checkpoint."
+            raise CheckpointError(f"{kind.__module__}.{kind.__qualname__}.{name}", value, got, fix)
 
 
 def _check_arguments(kind: type, given: dict[str, Any]) -> None:

@@ -106,7 +106,7 @@ def test_keyframes_are_exported_with_the_calibration_as_an_input(tmp_path, monke
 
 def test_a_policy_that_samples_and_looks_back_is_exported_too(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    policy = save(DiffusionPolicy(CAMERAS, 4, 2, False, unet_widths=(8, 16), unet_groups=4, step_dim=8, backbone_width=16, sampling_steps=2, sampler="ddim"))  # fmt: skip  # noqa: E501
+    policy = save(DiffusionPolicy(CAMERAS, 4, 2, False, unet_widths=(8, 16), backbone_width=16, sampling_steps=2, sampler="ddim"))  # fmt: skip  # noqa: E501
     assert main(["export", "policy.ckpt", "--to", "safetensors", "--out", "folder"]) == 0
     seen = look(policy)
     assert torch.equal(load_policy("folder")[0].predict(seen).actions, policy.predict(seen).actions)

@@ -82,9 +82,7 @@ def act(**options: Any) -> ACT:
 
 POLICIES: dict[str, Callable[[], ChunkPolicy]] = {
     **{path.stem: partial(configured, path) for path in [*CONFIGS.glob("*.yaml"), *CONFIGS.glob("controls/*.yaml")]},
-    "a decoder branch, noise and jitter": lambda: act(
-        refine=Uncertainty(), refine_branch="decoder", state_noise=0.1, color_jitter=0.2
-    ),
+    "jitter": lambda: act(refine=Uncertainty(), color_jitter=0.2),
     "a second look": lambda: act(
         keyframes=KeyframeSettings(zoom=16, zoom_levels=2), mirror=0.5, image_shift=4, color_jitter=0.2
     ),

@@ -27,7 +27,6 @@ COMPACT = {
     "position_in_values": True,
     "keypoints": 4,
     "state_dropout": 0.5,
-    "state_noise": 0.1,
     "image_shift": 2,
     "color_jitter": 0.1,
 }
@@ -350,12 +349,6 @@ def test_state_dropout_hides_its_share_of_samples_in_training(tiny):
     assert torch.equal(policy.eval().disturb(torch.ones(2, 14))[0], torch.ones(2, 14))
 
 
-def test_state_noise_has_its_size_and_stays_out_of_evaluation(tiny):
-    policy = tiny(state_noise=0.2)
-    assert policy.disturb(torch.zeros(4000, 14))[0].std().item() == pytest.approx(0.2, rel=0.05)
-    assert not policy.eval().disturb(torch.zeros(2, 14))[0].any()
-
-
 def test_wrong_observations_are_refused(tiny, batch):
     images, state, broken = batch.images, batch.state, batch.state.clone()
     broken[1, 3] = torch.nan
@@ -422,10 +415,3 @@ def test_base_with_the_parameters_of_uncert_has_exactly_as_many_and_learns_throu
     control.losses(batch)["loss"].backward()
     assert control.action_head.weight.grad.abs().sum() > 0
     assert control.branch.head.weight.grad.abs().sum() > 0
-
-
-def test_another_latent_is_another_style_and_zero_is_what_the_robot_executes(tiny, batch):
-    policy = tiny(refine=Uncertainty()).eval()
-    planned = policy.predict(batch.observation).actions
-    assert torch.equal(policy.predict(batch.observation, torch.zeros(3, 4)).actions, planned)
-    assert not torch.allclose(policy.predict(batch.observation, torch.ones(3, 4)).actions, planned)

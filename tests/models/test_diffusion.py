@@ -20,10 +20,7 @@ TINY: dict[str, Any] = {
     "diffusion_steps": 20,
     "sampler": "ddim",
     "sampling_steps": 4,
-    "unet_widths": [8, 16],
-    "unet_kernel": 3,
-    "unet_groups": 4,
-    "step_dim": 8,
+    "unet_widths": [16, 32],
     "backbone_width": 8,
     "precision": "fp32",
 }
@@ -241,7 +238,7 @@ def test_it_learns_two_ways_where_an_average_would_be_neither():
     """One picture, two demonstrations: both joints to +0.5 or both to -0.5; neither is the average, 0."""
     torch.manual_seed(0)
     toy = {"cameras": ["cam_high"], "chunk_length": 2, "state_dim": 2, "action_dim": 2, "unet_widths": [32]}
-    policy = DiffusionPolicy(**{**TINY, **toy, "step_dim": 16, "noise_draws": 64, "sampling_steps": 20})
+    policy = DiffusionPolicy(**{**TINY, **toy, "noise_draws": 64, "sampling_steps": 20})
     ones = torch.ones(2)
     policy.set_statistics(Statistics(*2 * (0 * ones, ones, -ones, ones)))
     actions = torch.tensor([0.5, -0.5])[:, None, None].expand(2, 2, 2)

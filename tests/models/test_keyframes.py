@@ -198,7 +198,7 @@ def test_a_policy_learns_with_keyframes_and_refuses_observations_without_calibra
     if kind != "diffusion":
         policy = tiny(backbone_stem="unshuffle", keypoints=2, image_shift=4, **settings)
     else:
-        sizes = {"unet_widths": (8, 16), "unet_groups": 4, "backbone_width": 8, "precision": "fp32"}
+        sizes = {"unet_widths": (8, 16), "backbone_width": 8, "precision": "fp32"}
         policy = DiffusionPolicy(CAMERAS, 10, 1, False, **sizes, **settings)
     policy.set_statistics(statistics)
     terms = policy.train().losses(samples)

@@ -22,8 +22,8 @@ from ugr_lightning.uncertainty.predictions import Predictions
 N, K = 12, 10
 
 
-def policy(branch):
-    built = tiny_act(refine=Uncertainty(), refine_branch=branch)
+def policy():
+    built = tiny_act(refine=Uncertainty())
     for layer in (built.branch.head, built.uncertainty_head):
         torch.nn.init.normal_(layer.weight)
     return built
@@ -40,9 +40,8 @@ def predictions(act):
     return Predictions(*errors, chunk.log_variance.double().numpy(), None, np.arange(N) // 3, np.arange(N))
 
 
-@pytest.mark.parametrize("branch", ["mlp", "decoder"])
-def test_offline_errors_are_those_of_a_policy_with_that_budget(branch):
-    act = policy(branch)
+def test_offline_errors_are_those_of_a_policy_with_that_budget():
+    act = policy()
     everything = predictions(with_refine_ratio(act, 1.0))
     for ratio in (0.1, 0.3, 0.7, 1.0):
         really = predictions(with_refine_ratio(act, ratio)).executed
@@ -52,7 +51,7 @@ def test_offline_errors_are_those_of_a_policy_with_that_budget(branch):
 
 
 def test_the_sweep_starts_at_coarse_ends_at_full_and_no_rule_beats_the_one_that_knows_the_gain():
-    everything = predictions(with_refine_ratio(policy("mlp"), 1.0))
+    everything = predictions(with_refine_ratio(policy(), 1.0))
     worse_first = np.arange(float(K))[None, ::-1]
     found = sweep(everything, worse_first, resamples=20)
     assert found.error["prior"] == found.error["head"] != found.error["tail"]
@@ -69,7 +68,7 @@ def test_the_sweep_starts_at_coarse_ends_at_full_and_no_rule_beats_the_one_that_
 
 @pytest.mark.parametrize("selector", [Uncertainty, Tail])
 def test_the_error_of_each_budget_is_that_of_the_policys_own_selector(selector):
-    act = policy("mlp")
+    act = policy()
     act.refine = selector()
     everything = predictions(with_refine_ratio(act, 1.0))
     found = budget_errors(act, everything, (0.0, 0.3, 1.0))
@@ -81,7 +80,7 @@ def test_the_error_of_each_budget_is_that_of_the_policys_own_selector(selector):
 
 
 def test_padded_steps_are_neither_chosen_nor_counted():
-    everything = predictions(with_refine_ratio(policy("mlp"), 1.0))
+    everything = predictions(with_refine_ratio(policy(), 1.0))
     everything.coarse[:, 6:] = np.nan
     everything.executed[:, 6:] = np.nan
     error = refined_error(everything, Uncertainty(0.3), everything.log_variance)

@@ -245,7 +245,6 @@ def check_plain(policy: ACT, project: str, drop_refinement: bool) -> None:
     published = {
         "backbone_stem": "standard",
         "backbone_width": 64,
-        "backbone_stride": 32,
         "camera_embedding": False,
         "position_in_values": False,
         "keypoints": 0,

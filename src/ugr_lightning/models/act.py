@@ -1,6 +1,6 @@
 """ACT, the Action Chunking Transformer, with the uncertainty-guided sparse refinement of the paper."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, NamedTuple
 
 import torch
@@ -29,7 +29,7 @@ from ugr_lightning.models.losses import (
 )
 from ugr_lightning.models.normalizer import Normalizer
 from ugr_lightning.models.precision import Precision, autocast, full_precision
-from ugr_lightning.models.refine.branch import BranchName, ResidualBranch
+from ugr_lightning.models.refine.branch import ResidualBranch
 from ugr_lightning.models.refine.selector import Selector, checked_budget
 from ugr_lightning.models.tokens import TokenPolicy
 from ugr_lightning.models.transformer import DecoderLayer, EncoderLayer
@@ -61,7 +61,6 @@ class ACT(TokenPolicy):
 
     Args:
         refine: which steps are refined: Full, Block, Uncertainty, a selector of your own, or null for none (`base`).
-        refine_branch: what computes the correction: `mlp` per step, or one more `decoder` layer.
         refine_detach_coarse: keep the refinement loss from changing the coarse actions; the paper lets it.
         uncertainty_head: predict a log-variance per step even where `refine` does not ask for it, for analysis.
         causal: let a step attend only to earlier ones in the decoder's self-attention (`cmask`).
@@ -86,7 +85,6 @@ class ACT(TokenPolicy):
         latent_dim: numbers in the latent.
         dropout: in all transformer layers.
         backbone_width: channels of the first stage of the ResNet-18; 64 is the usual one.
-        backbone_stride: pixels a token stands for, 32 or 16.
         backbone_stem: `standard`, or `unshuffle`, which is cheaper and has no published weights.
         backbone_norm: `frozen` (needs `backbone_weights`), `batch` (for training from scratch) or `group`.
         backbone_weights: file with ResNet-18 weights to start from: torchvision, original ACT or lerobot key names.
@@ -94,7 +92,6 @@ class ACT(TokenPolicy):
         position_in_values: add positions to the image tokens themselves, not to queries and keys alone.
         keypoints: number of spatial-softmax keypoints a camera, given as one more token each; 0 for none.
         state_dropout: probability, per sample, of hiding the state in training; 1 hides it at run time as well.
-        state_noise: standard deviation of noise on the state in training, in normalised units.
         image_shift: largest random displacement of the images in training, in pixels.
         color_jitter: largest random relative change of contrast and brightness in training.
         image_dropout: probability, per sample, of hiding image tokens and keypoints in training, never together with
@@ -109,13 +106,13 @@ class ACT(TokenPolicy):
     """
 
     not_kept: ClassVar[tuple[str, ...]] = ("backbone_weights",)
+    retired: ClassVar[Mapping[str, object]] = {"refine_branch": "mlp", "backbone_stride": 32, "state_noise": 0.0}
     exact: ClassVar[tuple[str, ...]] = ("action_head", "uncertainty_head")
     only_trained: ClassVar[tuple[str, ...]] = ("posterior",)
 
     def __init__(
         self,
         refine: Selector | None = None,
-        refine_branch: BranchName = "mlp",
         refine_detach_coarse: bool = False,
         uncertainty_head: bool = False,
         uncertainty_holdout: int = 0,
@@ -138,7 +135,6 @@ class ACT(TokenPolicy):
         latent_dim: int = 32,
         dropout: float = 0.1,
         backbone_width: int = 64,
-        backbone_stride: Literal[16, 32] = 32,
         backbone_stem: StemName = "standard",
         backbone_norm: NormName = "frozen",
         backbone_weights: str | None = None,
@@ -146,7 +142,6 @@ class ACT(TokenPolicy):
         position_in_values: bool = False,
         keypoints: int = 0,
         state_dropout: float = 0.0,
-        state_noise: float = 0.0,
         image_shift: int = 0,
         color_jitter: float = 0.0,
         image_dropout: float = 0.0,
@@ -159,7 +154,6 @@ class ACT(TokenPolicy):
             cameras,
             Normalizer(state_dim, action_dim),
             state_dropout=state_dropout,
-            state_noise=state_noise,
             image_dropout=image_dropout,
             image_shift=image_shift,
             color_jitter=color_jitter,
@@ -183,7 +177,7 @@ class ACT(TokenPolicy):
 
         self.posterior = Posterior(cvae_layers, latent_dim, state_dim, action_dim, *sizes) if cvae_layers else None
 
-        self.backbone = ResNet18(backbone_width, backbone_stride, backbone_stem, backbone_norm, backbone_fold)
+        self.backbone = ResNet18(backbone_width, backbone_stem, backbone_norm, backbone_fold)
         self.make_tokens_of(self.backbone, dim, latent_dim, keypoints, camera_embedding, position_in_values)
         built = 1 if decoder_readout == "first" else decoder_layers  # layers behind the readout would be dead
         self.encoder = nn.ModuleList(EncoderLayer(*sizes) for _ in range(encoder_layers))
@@ -196,7 +190,7 @@ class ACT(TokenPolicy):
 
         self.action_head = nn.Linear(dim, action_dim)
         self.uncertainty_head = nn.Linear(dim, 1) if wants_uncertainty else None
-        self.branch = ResidualBranch(refine_branch, *sizes, action_dim) if refine is not None else None
+        self.branch = ResidualBranch(dim, action_dim) if refine is not None else None
         self.budget = checked_budget(refine, chunk_length, wants_uncertainty) if refine is not None else None
         if backbone_weights is not None:
             self.backbone.load_weights(backbone_weights)
@@ -293,16 +287,11 @@ class ACT(TokenPolicy):
             coarse = self.action_head(whole)  # (B, K, A), A_0
             if self.uncertainty_head is not None:
                 log_variance = self.uncertainty_head(whole.detach()).squeeze(-1).clamp(-10, 10)  # (B, K), s
-        actions, refined = self.refined(hidden, coarse, log_variance, valid, (memory, memory_keys))
+        actions, refined = self.refined(hidden, coarse, log_variance, valid)
         return Plan(actions, coarse, log_variance, refined, sighting)
 
     def refined(
-        self,
-        hidden: Tensor,
-        coarse: Tensor,
-        log_variance: Tensor | None,
-        valid: Tensor,
-        memory: tuple[Tensor, Tensor] | None = None,
+        self, hidden: Tensor, coarse: Tensor, log_variance: Tensor | None, valid: Tensor
     ) -> tuple[Tensor, Tensor | None]:
         """A_1 of A_0; paper, Eq. (3) to (5).
 
@@ -311,7 +300,6 @@ class ACT(TokenPolicy):
             coarse: (B, K, A) float32, A_0, normalised.
             log_variance: (B, K) float32, s; None without an uncertainty head.
             valid: (B, K) bool, False on padded steps.
-            memory: (B, N, D) twice, without and with positions, for the branch `decoder`.
 
         Returns:
             (B, K, A) float32, A_1, and (B, K) bool, m; None where nothing refines.
@@ -321,10 +309,10 @@ class ACT(TokenPolicy):
         chosen = self.refine.select(None if log_variance is None else log_variance.detach(), valid, self.training)
         start = coarse.detach() if self.refine_detach_coarse else coarse
         with autocast(self.precision, coarse.device):
-            if self.branch.stepwise and self.budget is not None and not torch.is_grad_enabled():
+            if self.budget is not None and not torch.is_grad_enabled():
                 residual = self.branch.at(chosen, self.budget, hidden, start)  # (B, K, A), m * dA
             else:
-                residual = self.branch(hidden, start, self.query_embed, memory)  # (B, K, A), dA
+                residual = self.branch(hidden, start)  # (B, K, A), dA
         return start + chosen[..., None] * residual, chosen  # A_1 = A_0 + m * dA
 
     def _lessons(self, batch: Batch) -> tuple[Tensor, Tensor]:

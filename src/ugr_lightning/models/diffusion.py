@@ -1,7 +1,7 @@
 """Diffusion Policy: chunks made from noise by a U-Net that is conditioned on the observations."""
 
-from collections.abc import Sequence
-from typing import ClassVar, Literal
+from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -34,16 +34,12 @@ class DiffusionPolicy(PicturePolicy):
         diffusion_steps: steps from a clean chunk to noise in training.
         sampler: `ddpm` or `ddim`; the latter needs few steps.
         sampling_steps: steps from noise to a chunk at run time.
-        prediction: what the U-Net predicts: the noise (`epsilon`), the clean `sample`, or a mix, `v_prediction`.
+        prediction: what the U-Net predicts: the noise (`epsilon`) or the clean `sample`.
         noise_draws: noisy versions of each chunk in a batch; more cost little, as the images are looked at once.
         noise_seed: seed of the noise that every prediction starts from.
         unet_widths: channels of each level of the U-Net; every level but the last halves the number of steps.
-        unet_kernel: steps that a convolution sees.
-        unet_groups: groups of its normalisation.
-        step_dim: numbers that encode the diffusion step.
         share_backbone: one ResNet-18 for all cameras; otherwise one for each.
         backbone_width: channels of the first stage of the ResNet-18; 64 is the usual one.
-        backbone_stride: total stride, 32 or 16.
         backbone_stem: `standard`, or `unshuffle`, which is cheaper and has no published weights.
         backbone_norm: `group`, `batch`, or `frozen` (needs `backbone_weights`).
         backbone_weights: file with ResNet-18 weights to start from: torchvision, original ACT or lerobot key names.
@@ -62,6 +58,12 @@ class DiffusionPolicy(PicturePolicy):
     """
 
     not_kept: ClassVar[tuple[str, ...]] = ("backbone_weights",)
+    retired: ClassVar[Mapping[str, object]] = {
+        "unet_kernel": 5,
+        "unet_groups": 8,
+        "step_dim": 128,
+        "backbone_stride": 32,
+    }
     exact: ClassVar[tuple[str, ...]] = ("unet.head",)
 
     def __init__(
@@ -79,12 +81,8 @@ class DiffusionPolicy(PicturePolicy):
         noise_draws: int = 1,
         noise_seed: int = 0,
         unet_widths: Sequence[int] = (256, 512, 1024),
-        unet_kernel: int = 5,
-        unet_groups: int = 8,
-        step_dim: int = 128,
         share_backbone: bool = False,
         backbone_width: int = 64,
-        backbone_stride: Literal[16, 32] = 32,
         backbone_stem: StemName = "standard",
         backbone_norm: NormName = "group",
         backbone_weights: str | None = None,
@@ -102,7 +100,6 @@ class DiffusionPolicy(PicturePolicy):
             cameras,
             Normalizer(state_dim, action_dim, "min_max"),
             state_dropout=state_dropout,
-            state_noise=0.0,
             image_dropout=image_dropout,
             image_shift=image_shift,
             color_jitter=color_jitter,
@@ -124,15 +121,13 @@ class DiffusionPolicy(PicturePolicy):
 
         count = 1 if share_backbone else len(self.cameras)
         self.backbones = nn.ModuleList(
-            ResNet18(backbone_width, backbone_stride, backbone_stem, backbone_norm, backbone_fold) for _ in range(count)
+            ResNet18(backbone_width, backbone_stem, backbone_norm, backbone_fold) for _ in range(count)
         )
         channels, middle = 8 * backbone_width, 4 * backbone_width
         self.keypoint_maps = nn.ModuleList(nn.Conv2d(middle, keypoints, 1) for _ in range(count if keypoints else 0))
         told = ARMS * FEATURES if keyframes is not None else 0
         seen = len(self.cameras) * (channels + 2 * keypoints) + told + state_dim
-        self.unet = ConditionalUNet(
-            action_dim, observation_steps * seen, unet_widths, unet_kernel, unet_groups, step_dim
-        )
+        self.unet = ConditionalUNet(action_dim, observation_steps * seen, unet_widths)
         self.process = NoiseProcess(diffusion_steps, sampler, sampling_steps, prediction)
         if backbone_weights is not None:
             for backbone in self._backbones():

@@ -9,7 +9,7 @@ from torch import Tensor
 from ugr_lightning.errors import ConfigError, require_extra
 
 SamplerName = Literal["ddpm", "ddim"]
-PredictionName = Literal["epsilon", "sample", "v_prediction"]
+PredictionName = Literal["epsilon", "sample"]
 
 Denoiser = Callable[[Tensor, Tensor], Tensor]
 """From a noisy chunk (B, L, A) and its diffusion steps (B,) to the prediction (B, L, A)."""
@@ -22,7 +22,7 @@ class NoiseProcess:
         steps: diffusion steps of training.
         sampler: `ddpm` adds fresh noise in every step; `ddim` adds none and needs few steps.
         sampling_steps: diffusion steps of sampling, at most `steps`.
-        prediction: what the network predicts: the noise (`epsilon`), the clean `sample`, or a mix, `v_prediction`.
+        prediction: what the network predicts: the noise (`epsilon`) or the clean `sample`.
 
     Raises:
         ConfigError: more sampling steps than diffusion steps, an unknown name, or diffusers is not installed.
@@ -47,8 +47,8 @@ class NoiseProcess:
             raise ConfigError("sampling_steps", f"1 to {steps} (diffusion_steps)", sampling_steps, fix)
         if sampler not in ("ddpm", "ddim"):
             raise ConfigError("sampler", "`ddpm` or `ddim`", sampler, "Correct the name.")
-        if prediction not in ("epsilon", "sample", "v_prediction"):
-            raise ConfigError("prediction", "`epsilon`, `sample` or `v_prediction`", prediction, "Correct the name.")
+        if prediction not in ("epsilon", "sample"):
+            raise ConfigError("prediction", "`epsilon` or `sample`", prediction, "Correct the name.")
         self.steps, self.prediction = steps, prediction
         common = {
             "num_train_timesteps": steps,
@@ -72,11 +72,7 @@ class NoiseProcess:
             (B, L, A) noisy chunks, and (B, L, A) what the network has to predict from them.
         """
         noisy = self.scheduler.add_noise(clean, noise, step)
-        if self.prediction == "epsilon":
-            return noisy, noise
-        if self.prediction == "sample":
-            return noisy, clean
-        return noisy, self.scheduler.get_velocity(clean, noise, step)
+        return noisy, noise if self.prediction == "epsilon" else clean
 
     def sample(self, denoise: Denoiser, shape: tuple[int, int, int], seed: int, device: torch.device) -> Tensor:
         """Chunks made from noise; rows with equal predictions come out equal, in a batch of any size.

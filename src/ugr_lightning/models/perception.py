@@ -39,7 +39,6 @@ class PicturePolicy(ChunkPolicy):
         cameras: names of the cameras, in the order of the images.
         normalizer: of states and actions.
         state_dropout: probability, per sample, of hiding the state in training; 1 hides it at run time as well.
-        state_noise: standard deviation of noise on the state in training, in normalised units.
         image_dropout: probability, per sample, of hiding the image features in training, never together with the state.
         image_shift: largest random displacement of the images in training, in pixels.
         color_jitter: largest random relative change of contrast and brightness in training.
@@ -62,7 +61,6 @@ class PicturePolicy(ChunkPolicy):
         normalizer: Normalizer,
         *,
         state_dropout: float,
-        state_noise: float,
         image_dropout: float,
         image_shift: int,
         color_jitter: float,
@@ -79,7 +77,7 @@ class PicturePolicy(ChunkPolicy):
         if mirror:
             check_mirror(cameras, len(normalizer.state_shift), len(normalizer.action_shift))
         self.cameras, self.normalizer = tuple(cameras), normalizer
-        self.state_dropout, self.state_noise, self.image_dropout = state_dropout, state_noise, image_dropout
+        self.state_dropout, self.image_dropout = state_dropout, image_dropout
         self.image_shift, self.color_jitter, self.mirror = image_shift, color_jitter, mirror
         self.precision = precision
         widths = (backbone_width, 2 * backbone_width, 4 * backbone_width)
@@ -138,7 +136,7 @@ class PicturePolicy(ChunkPolicy):
         return mirror_batch(batch, chosen, self.cameras)
 
     def disturb(self, state: Tensor) -> tuple[Tensor, Tensor | None]:
-        """In training, noise on states, states hidden, and which samples may not see; a hidden state is the mean state.
+        """In training, states hidden, and which samples may not see; a hidden state is the mean state.
 
         Args:
             state: (B, S) normalised, or (B, T, S).
@@ -146,8 +144,6 @@ class PicturePolicy(ChunkPolicy):
         Returns:
             The state, and (B,) True where the image features are hidden; None where no sample's are.
         """
-        if self.training and self.state_noise:
-            state = state + self.state_noise * torch.randn_like(state)
         if self.state_dropout >= 1:
             return torch.zeros_like(state), None
         if not self.training or not (self.state_dropout or self.image_dropout):

@@ -106,7 +106,6 @@ class ResNet18(nn.Module):
 
     Args:
         width: channels of the first stage; 64 is ResNet-18, the last stage has eight times as many.
-        stride: total stride, 32 or 16 (then the last stage keeps its resolution).
         stem: `standard` is 7x7 stride 2 and max pooling; `unshuffle` folds squares of pixels into channels and
             convolves 3x3, which is several times cheaper on a CPU.
         norm: `frozen` batch norm (needs trained weights), `batch` statistics, or `group`.
@@ -126,14 +125,11 @@ class ResNet18(nn.Module):
     def __init__(
         self,
         width: int = 64,
-        stride: Literal[16, 32] = 32,
         stem: StemName = "standard",
         norm: NormName = "frozen",
         fold: Fold = 4,
     ) -> None:
         super().__init__()
-        if stride not in (16, 32):
-            raise ConfigError("backbone_stride", "16 or 32", stride, "Choose one of the two.")
         if width < 8 or width % 8:
             raise ConfigError("backbone_width", "a multiple of 8", width, "Use 8, 16, 32 or 64.")
         self.stem, self.norm, self.fold = stem, norm, fold
@@ -142,11 +138,10 @@ class ResNet18(nn.Module):
         else:
             self.conv1 = nn.Conv2d(3 * fold * fold, width, 3, 1, 1, bias=False)
         self.bn1 = make_norm(norm, width)
-        strides = (1, 2, 2, 2 if stride == 32 else 1)
         inputs = width
-        for stage, step in enumerate(strides, start=1):
+        for stage, stride in enumerate((1, 2, 2, 2), start=1):
             outputs = width << (stage - 1)
-            blocks = BasicBlock(inputs, outputs, step, norm), BasicBlock(outputs, outputs, 1, norm)
+            blocks = BasicBlock(inputs, outputs, stride, norm), BasicBlock(outputs, outputs, 1, norm)
             self.add_module(f"layer{stage}", nn.Sequential(*blocks))
             inputs = outputs
         self.channels, self.middle_channels = width * 8, width * 4
@@ -193,7 +188,7 @@ class ResNet18(nn.Module):
 
         Returns:
             (n, width 2^i, ...) features of the stages i = 0 .. 3: a quarter of the picture's resolution (an eighth
-            where 8x8 pixels are folded), then half as fine each; the last as its stride says.
+            where 8x8 pixels are folded), then half as fine each.
 
         Raises:
             ConfigError: frozen normalisation without trained weights.

@@ -58,7 +58,7 @@ def selectors(ratio: float, prior: np.ndarray, everything: Predictions) -> dict[
 def refined_error(everything: Predictions, selector: Ranked, score: np.ndarray) -> np.ndarray:
     """Error (n, K) of the executed actions when a selector decides which steps are refined.
 
-    Exact for every branch: a correction does not depend on which other steps are corrected.
+    Exact: a correction does not depend on which other steps are corrected.
 
     Args:
         everything: predictions with all steps refined.

@@ -39,7 +39,7 @@ def with_refinement(policy: ACT, refine: Selector) -> ACT:
 
     Args:
         policy: a trained one.
-        refine: which steps are to be refined, each by itself.
+        refine: which steps are to be refined.
 
     Raises:
         ConfigError: the policy lacks what the refinement needs.
@@ -49,7 +49,7 @@ def with_refinement(policy: ACT, refine: Selector) -> ACT:
         fix = "Choose other steps, or train one that foresees them, e.g. `--config uncert`."
         raise ConfigError(f"refine: {type(refine).__name__}", "a policy with an uncertainty head", "none", fix)
     built = policy.blueprint()
-    changed = {"refine": refine.blueprint(), "refine_branch": "mlp", "uncertainty_head": foresees}
+    changed = {"refine": refine.blueprint(), "uncertainty_head": foresees}
     unrefined = {k: v for k, v in policy.state_dict().items() if not k.startswith("branch.")}
     refining: Any = rebuild(built | {"init_args": built["init_args"] | changed})
     refining.load_state_dict(unrefined, strict=False)

@@ -11,24 +11,23 @@ from ugr_lightning.models.refine.tail import Tail
 from ugr_lightning.models.refine.uncertainty import Uncertainty
 
 
-def trained(tiny, refine, **changes):
+def trained(tiny, refine):
     """A policy whose branch and head are no longer at their initial zeros."""
-    policy = tiny(refine=refine, **changes).eval()
+    policy = tiny(refine=refine).eval()
     torch.manual_seed(5)
     for layer in (policy.branch.head, policy.uncertainty_head):
         torch.nn.init.normal_(layer.weight)
     return policy
 
 
-@pytest.mark.parametrize("branch", ["mlp", "decoder"])
-def test_ratio_zero_is_exactly_the_coarse_policy_and_ratio_one_exactly_full_refinement(tiny, batch, branch):
-    policy = trained(tiny, Uncertainty(), refine_branch=branch)
+def test_ratio_zero_is_exactly_the_coarse_policy_and_ratio_one_exactly_full_refinement(tiny, batch):
+    policy = trained(tiny, Uncertainty())
     planned = policy.predict(batch.observation)
     nothing = with_refine_ratio(policy, 0.0).predict(batch.observation)
     assert torch.equal(nothing.actions, planned.coarse)
     assert nothing.refined is None
     everything = with_refine_ratio(policy, 1.0).predict(batch.observation)
-    full = tiny(refine=Full(), uncertainty_head=True, refine_branch=branch).eval()
+    full = tiny(refine=Full(), uncertainty_head=True).eval()
     full.load_state_dict(policy.state_dict())
     assert torch.equal(everything.actions, full.predict(batch.observation).actions)
     assert everything.refined.all()
