@@ -213,6 +213,24 @@ def test_a_damaged_episode_is_found_before_anything_is_written(recording, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "made", "message"),
+    [
+        ("original-act", {}, "control_hz.*--rate"),
+        ("lerobot", {}, "one rate.*--rate"),
+        ("robotwin", {"width": 7}, "two arms.*Convert to `act`"),
+    ],
+)
+def test_what_the_target_needs_is_asked_for_before_anything_is_written(name, made, message, tmp_path):
+    skip_without_extra(name)
+    source = write_act(tmp_path / "source", 2, **made)
+    with pytest.raises(DataError, match=message):
+        convert(source, tmp_path / "out", name)
+    assert not (tmp_path / "out").exists()
+    if name != "robotwin":
+        assert len(convert(source, tmp_path / "out", name, rate=17)) == 2
+
+
 def test_a_full_disk_is_an_error_of_ours_and_the_next_run_goes_on(recording, tmp_path, monkeypatch):
     def full(path, write):
         if path.name == "episode_1.hdf5":

@@ -56,7 +56,8 @@ def convert(
     Raises:
         DataError: a damaged episode, one that the format cannot hold, a target with something else in it, a disk that
             is full, or numbers that did not come back as they were.
-        ConfigError: an unknown format or camera, one that is only read, or a target that is the source.
+        ConfigError: an unknown format or camera, one that is only read, a package that is missing, or a target that is
+            the source.
     """
     source, target = Path(source), Path(target)
     form = find_format(to)
@@ -65,6 +66,7 @@ def convert(
         raise ConfigError("--to", f"a format that can be written: {written}", to, "Choose another.")
     _check_target(source, target)
     found = _read_all(source, cameras, layout, selection, rate, done)
+    form.check(found)
     note = _describe(found, source, to)
     try:
         with _alone(target):

@@ -1,5 +1,6 @@
 """The original ACT's HDF5: measured joints and velocities, any cameras, simulated or from a real robot."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import h5py
@@ -47,6 +48,12 @@ class OriginalAct(ProcessedAct):
             extras["qvel"] = read_array(file, QVEL, (steps, None))
         return extras
 
+    def check(self, episodes: Sequence[Episode]) -> None:
+        for episode in episodes:
+            if "qvel" not in episode.extras and episode.extras.get("control_hz") is None:
+                fix = "State the steps per second with `--rate`, or convert to `act`, which needs no velocities."
+                raise DataError(episode.path, "`control_hz`, to derive joint velocities from", "none", fix)
+
     def _write_joints(self, file: h5py.File, episode: Episode) -> None:
         file.attrs["sim"] = bool(episode.extras.get("sim", True))  # true: its loader then takes action[t] for step t
         file[QPOS], file[QVEL] = _joints(episode), _velocities(episode)  # (T, S) float32
@@ -63,9 +70,5 @@ def _velocities(episode: Episode) -> np.ndarray:
     """The velocities that were recorded, or else the differences of the joints, (T, S) float32, per second."""
     if "qvel" in episode.extras:
         return np.asarray(episode.extras["qvel"], np.float32)
-    rate = episode.extras.get("control_hz")
-    if rate is None:
-        fix = "State the steps per second with `--rate`, or convert to `act`, which needs no velocities."
-        raise DataError(episode.path, "`control_hz`, to derive joint velocities from", "none", fix)
     joints = _joints(episode)
-    return np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(rate)
+    return np.diff(joints, axis=0, prepend=joints[:1]) * np.float32(episode.extras["control_hz"])
