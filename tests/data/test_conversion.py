@@ -2,10 +2,13 @@
 
 import os
 import shutil
+from dataclasses import replace
 
+import h5py
 import numpy as np
 import pytest
 from folders import files_of
+from foreign_files import write_act
 from recordings import record
 
 from ugr_lightning.data.conversion import NOTE, convert, left_out
@@ -210,6 +213,24 @@ def test_a_damaged_episode_is_found_before_anything_is_written(recording, tmp_pa
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "made", "message"),
+    [
+        ("original-act", {}, "control_hz.*--rate"),
+        ("lerobot", {}, "one rate.*--rate"),
+        ("robotwin", {"width": 7}, "two arms.*Convert to `act`"),
+    ],
+)
+def test_what_the_target_needs_is_asked_for_before_anything_is_written(name, made, message, tmp_path):
+    skip_without_extra(name)
+    source = write_act(tmp_path / "source", 2, **made)
+    with pytest.raises(DataError, match=message):
+        convert(source, tmp_path / "out", name)
+    assert not (tmp_path / "out").exists()
+    if name != "robotwin":
+        assert len(convert(source, tmp_path / "out", name, rate=17)) == 2
+
+
 def test_a_full_disk_is_an_error_of_ours_and_the_next_run_goes_on(recording, tmp_path, monkeypatch):
     def full(path, write):
         if path.name == "episode_1.hdf5":
@@ -265,3 +286,52 @@ def test_what_has_no_place_in_the_target_is_told(recording, tmp_path):
     assert left_out(find_format("act"), tmp_path / "out", episodes) == LOST
     again = convert(recording, tmp_path / "again", "robotwin")
     assert left_out(find_format("robotwin"), tmp_path / "again", again) == LOST
+    original = convert(recording, tmp_path / "original", "original-act")
+    assert left_out(find_format("original-act"), tmp_path / "original", original) == [
+        name for name in LOST if name != "measured"
+    ]
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_measured_joints_come_back_as_they_were_or_not_at_all_and_are_told(name, recording, tmp_path):
+    skip_without_extra(name)
+    given = convert(recording, tmp_path / "out", name)
+    assert not any(np.array_equal(one.measured, one.state) for one in given)
+    back = read_all(tmp_path / "out")
+    told = "measured" in left_out(find_format(name), tmp_path / "out", given)
+    assert all(other.measured is None for other in back) == told
+    assert told or all(np.array_equal(one.measured, other.measured) for one, other in zip(given, back, strict=True))
+
+
+def test_the_original_act_finds_measured_joints_and_their_velocities(recording, tmp_path):
+    convert(recording, tmp_path / "out", "original-act")
+    convert(recording, tmp_path / "act", "act")
+    convert(tmp_path / "act", tmp_path / "again", "original-act")
+    for index, one in enumerate(read_all(recording)):
+        with h5py.File(tmp_path / f"out/episode_{index}.hdf5") as file:
+            assert np.array_equal(file["observations/qpos"], one.measured)
+            assert np.allclose(file["observations/qvel"][1:], np.diff(one.measured, axis=0) * 25)
+    for one, other in zip(read_all(tmp_path / "act"), read_all(tmp_path / "again"), strict=True):
+        assert np.array_equal(one.state, other.state)
+        assert other.measured is None, "nobody has measured them"
+
+
+def test_velocities_of_other_joints_are_not_taken_along(tmp_path):
+    write_act(tmp_path / "source", 2, original=True)
+    options = {"layout": Layout(state=(2, 0)), "rate": 10}
+    convert(tmp_path / "source", tmp_path / "out", "original-act", **options)
+    with h5py.File(tmp_path / "out/episode_0.hdf5") as file:
+        assert np.allclose(file["observations/qvel"][1:], np.diff(file["observations/qpos"], axis=0) * 10)
+
+
+def test_a_value_that_comes_back_as_another_is_told(recording, tmp_path, monkeypatch):
+    episodes = convert(recording, tmp_path / "out", "act")
+    changed = [*episodes[:-1], replace(episodes[-1], seed=77)]
+    assert left_out(find_format("act"), tmp_path / "out", changed) == sorted([*LOST, "seed"])
+
+
+def test_measured_joints_that_were_not_measured_are_noticed(recording, tmp_path, monkeypatch):
+    form = type(find_format("act"))
+    monkeypatch.setattr(form, "_read_joints", lambda self, file, qpos: (qpos, qpos))
+    with pytest.raises(DataError, match="other numbers"):
+        convert(recording, tmp_path / "out", "act")

@@ -213,6 +213,16 @@ def test_right_marks_of_both_kinds_are_only_mentioned(make):
     assert all("with and without the mark" in line for line in found)
 
 
+def test_pictures_of_a_later_episode_in_another_size_are_told_with_what_to_do(make):
+    make(0)
+    small = np.ascontiguousarray(scene(STEPS + 1)[:, :, :20])
+    found = oddities(make(1, images=small))
+    assert [line for line in found if "size" in line] == [
+        *(f"{camera} has different sizes: 20x32, 24x32" for camera in CAMERAS),
+        "pictures differ in size: give them one with `data.image_size` to train on them",
+    ]
+
+
 def test_duplicates_gaps_and_leftovers_are_found(make):
     make(0)
     make(1, joints=smooth(0))

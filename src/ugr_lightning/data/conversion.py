@@ -56,7 +56,8 @@ def convert(
     Raises:
         DataError: a damaged episode, one that the format cannot hold, a target with something else in it, a disk that
             is full, or numbers that did not come back as they were.
-        ConfigError: an unknown format or camera, one that is only read, or a target that is the source.
+        ConfigError: an unknown format or camera, one that is only read, a package that is missing, or a target that is
+            the source.
     """
     source, target = Path(source), Path(target)
     form = find_format(to)
@@ -65,6 +66,7 @@ def convert(
         raise ConfigError("--to", f"a format that can be written: {written}", to, "Choose another.")
     _check_target(source, target)
     found = _read_all(source, cameras, layout, selection, rate, done)
+    form.check(found)
     note = _describe(found, source, to)
     try:
         with _alone(target):
@@ -171,31 +173,41 @@ def _check_note(target: Path, note: dict[str, Any]) -> None:
 
 
 def _check_written(form: EpisodeFormat, target: Path, episodes: Sequence[Episode], done: Done) -> None:
-    """Read everything back: state and action have to be the same to the bit."""
-    locations = form.find(target)
-    if list(locations) != list(range(len(episodes))):
-        raise DataError(target, f"episodes 0 to {len(episodes) - 1}", list(locations)[:8], "Convert again.")
-    for number, (location, given) in enumerate(zip(locations.values(), episodes, strict=True), start=1):
-        layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
-        back = form.read(location, given.cameras, layout)
+    """Read everything back: state and action have to be the same to the bit, measured joints the same or none."""
+    if list(form.find(target)) != list(range(len(episodes))):
+        raise DataError(target, f"episodes 0 to {len(episodes) - 1}", list(form.find(target))[:8], "Convert again.")
+    for number, (back, given) in enumerate(_read_back(form, target, episodes), start=1):
         same = np.array_equal(back.state, given.state) and np.array_equal(back.action, given.action)
+        same = same and (back.measured is None or _same(back.measured, given.measured))
         if not same or back.frames.image_sizes != given.frames.image_sizes:
             got = "other numbers, or pictures of another size"
             raise DataError(back.path, f"what {given.path} has", got, "Remove this file and convert again.")
         done("checking", number, len(episodes))
 
 
+def _read_back(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -> Iterator[tuple[Episode, Episode]]:
+    """What was written, each beside what was given."""
+    for location, given in zip(form.find(target).values(), episodes, strict=True):
+        layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
+        yield form.read(location, given.cameras, layout), given
+
+
 def left_out(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -> list[str]:
-    """What the source says of an episode and the target has no place for, by name.
+    """What the source says of any episode and the target does not give back as it was, by name.
 
     Args:
         form: the format written.
         target: the folder written.
         episodes: as `convert` returns them.
     """
-    given = episodes[0]
-    layout = Layout(state=given.state.shape[1], action=given.action.shape[1])
-    back = form.read(form.find(target)[0], given.cameras, layout)
     fields = ("seed", "measured", "endpose", "projection")
-    known, kept = ({**{name: getattr(of, name) for name in fields}, **of.extras} for of in (given, back))
-    return sorted(name for name, value in known.items() if value is not None and kept.get(name) is None)
+    lost: set[str] = set()
+    for both in _read_back(form, target, episodes):
+        kept, known = ({**{name: getattr(of, name) for name in fields}, **of.extras} for of in both)
+        lost |= {name for name, value in known.items() if value is not None and not _same(value, kept.get(name))}
+    return sorted(lost)
+
+
+def _same(one: Any, other: Any) -> bool:
+    """Whether two values are equal, arrays in every number."""
+    return np.array_equal(one, other)

@@ -93,8 +93,8 @@ def _sizes(seen: Sequence[SeenEpisode]) -> Iterable[str]:
         sizes = {one.views[camera].size for one in seen}
         if len(sizes) > 1:
             yield f"{camera} has different sizes: {shorten([f'{h}x{w}' for h, w in sorted(sizes)])}"
-    if len({view.size for view in seen[0].views.values()}) > 1:
-        yield "cameras differ in size: give them one with `data.image_size` to train on them"
+    if len({view.size for one in seen for view in one.views.values()}) > 1:
+        yield "pictures differ in size: give them one with `data.image_size` to train on them"
 
 
 def _constant(found: Inspection) -> Iterable[str]:

@@ -8,9 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from foreign_files import ACT_CAMERAS, write_act
+from PIL import Image
 from recordings import arrays, record
 
 from ugr_lightning.data.folder import episode_path, find_episodes
+from ugr_lightning.data.formats import detect
 from ugr_lightning.data.formats.robotwin import read_episode, write_episode
 from ugr_lightning.data.storage import cache as cache_module
 from ugr_lightning.data.storage.cache import open_frames
@@ -146,10 +149,26 @@ def test_stores_travel_to_other_processes(cache, folder):
     np.testing.assert_array_equal(pickle.loads(packed).take(np.array([9])), store.take(np.array([9])))
 
 
-def test_episodes_of_different_sizes_are_refused(folder):
-    write_episode(episode_path(folder, 1), **arrays(size=(16, 16)))
-    with pytest.raises(DataError, match="one image size"):
-        open_frames(_episodes(folder), "ram")
+OF_THE_SECOND = {"all cameras": dict.fromkeys(ACT_CAMERAS, (20, 16)), "one camera": {"cam_left_wrist": (30, 40)}}
+
+
+@pytest.mark.parametrize("cache", ["ram", "memmap", "none"])
+@pytest.mark.parametrize("case", OF_THE_SECOND)
+def test_pictures_of_different_sizes_need_one_whichever_episode_and_camera_they_are_of(case, cache, tmp_path):
+    write_act(tmp_path, 1)
+    write_act(tmp_path, 1, name="episode_1{}.hdf5", sizes=OF_THE_SECOND[case])
+    form = detect(tmp_path)
+    episodes = [form.read(location, ACT_CAMERAS) for location in form.find(tmp_path).values()]
+    other, smallest = ("20x16", "20,16") if case == "all cameras" else ("30x40", "24,32")
+    message = rf"24x32 in cam_high of episode_0 .*, {other} in .* of episode_10 .*image_size \[{smallest}\]"
+    with pytest.raises(ConfigError, match=message):
+        open_frames(episodes, cache)
+    pictures = open_frames(episodes, cache, (12, 16)).take(np.array([0, 14]))
+    assert pictures.shape == (2, 3, 12, 16, 3)
+    larger = np.asarray(Image.fromarray(episodes[1].frames.pictures(0)[2]).resize((16, 12), Image.Resampling.BOX))
+    np.testing.assert_array_equal(pictures[1, 2], larger)
+    with pytest.raises(ConfigError, match="at most the stored size"):
+        open_frames(episodes, cache, (25, 32))
 
 
 @pytest.mark.parametrize("image_size", [(48, 64), (24, 33), (0, 5)])

@@ -114,6 +114,14 @@ class EpisodeFormat(ABC):
             ConfigError: a camera that the file does not have.
         """
 
+    def check(self, episodes: Sequence[Episode]) -> None:  # noqa: B027 - a format may hold every episode
+        """Find out whether `write` can write these episodes; it begins with this, before it touches anything.
+
+        Raises:
+            DataError: an episode that the format cannot hold; says why.
+            ConfigError: a package is missing.
+        """
+
     def write(
         self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None
     ) -> None:
@@ -125,7 +133,7 @@ class EpisodeFormat(ABC):
             done: called with the index of every episode that is on disk.
 
         Raises:
-            ConfigError: this format is only read.
+            ConfigError: this format is only read, or a package is missing.
             DataError: an episode that the format cannot hold; says why.
         """
         raise ConfigError("--to", "a format that can be written", self.name, "Choose another.")
@@ -160,6 +168,7 @@ class NumberedFiles(EpisodeFormat):
         self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None
     ) -> None:
         """Write one file per episode, see `EpisodeFormat.write`."""
+        self.check(episodes)
         others = [one.name for one in recognise(folder) if one.name != self.name]
         if others:
             fix = "Choose an empty folder."
@@ -176,11 +185,10 @@ class NumberedFiles(EpisodeFormat):
         return folder / f"episode_{index}.hdf5"
 
     def fill(self, file: h5py.File, episode: Episode) -> None:
-        """Write one episode into an open, empty file.
+        """Write one episode, which was checked, into an open, empty file.
 
         Raises:
             ConfigError: this format is only read.
-            DataError: an episode that the format cannot hold; says why.
         """
         raise ConfigError("--to", "a format that can be written", self.name, "Choose another.")
 

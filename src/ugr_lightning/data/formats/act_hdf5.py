@@ -48,14 +48,14 @@ class ProcessedAct(NumberedFiles):
         path = location.path
         with open_hdf5(path) as file:
             views = layout.find_cameras(cameras, list_keys(file, IMAGES), path)
-            state = read_array(file, QPOS, (None, None))
-            if len(state) < 1:
+            qpos = read_array(file, QPOS, (None, None))
+            if len(qpos) < 1:
                 raise DataError(f"{path}:{QPOS}", "at least 1 row", 0, FIX)
-            action = read_array(file, ACTION, (len(state), None))
+            action = read_array(file, ACTION, (len(qpos), None))
             origins = tuple(f"{ORIGINS}/{view}" for view in views) if has_key(file, ORIGINS) else ()
-            frames = hdf5_frames(file, tuple(f"{IMAGES}/{view}" for view in views), len(state), origins)
-            measured, extras = self._read_further(file, state)
-            extras |= read_about(file)
+            frames = hdf5_frames(file, tuple(f"{IMAGES}/{view}" for view in views), len(qpos), origins)
+            state, measured = self._read_joints(file, qpos)
+            extras = self._read_further(file, len(qpos), layout) | read_about(file)
         return Episode(
             path=path,
             cameras=tuple(cameras),
@@ -67,9 +67,13 @@ class ProcessedAct(NumberedFiles):
             extras=extras,
         )
 
-    def _read_further(self, file: h5py.File, state: np.ndarray) -> tuple[np.ndarray | None, dict[str, Any]]:
-        """Measured joints, where `qpos` is that, and what else the file says."""
-        return None, {}
+    def _read_joints(self, file: h5py.File, qpos: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+        """The state, and the measured joints where the file has them, (T, D) each."""
+        return qpos, None
+
+    def _read_further(self, file: h5py.File, steps: int, layout: Layout) -> dict[str, Any]:
+        """What else the file says."""
+        return {}
 
     def fill(self, file: h5py.File, episode: Episode) -> None:
         """Write one episode, its frames one at a time at the size they have.
@@ -77,8 +81,8 @@ class ProcessedAct(NumberedFiles):
         JPEGs that they come from are kept beside them, about a tenth more, so that the way back loses nothing.
         """
         write_about(file, episode)
-        file[ACTION], file[QPOS] = episode.action, episode.state  # (T, A) and (T, S) float32
-        self._write_further(file, episode)
+        file[ACTION] = episode.action  # (T, A) float32
+        self._write_joints(file, episode)
         pictures = []
         for camera, size in zip(episode.cameras, episode.frames.image_sizes, strict=True):
             shape = (episode.length, *size, 3)
@@ -93,8 +97,9 @@ class ProcessedAct(NumberedFiles):
             for view, camera in enumerate(episode.cameras):
                 file[f"{ORIGINS}/{camera}"] = np.array([step[view] for step in kept], dtype=bytes)
 
-    def _write_further(self, file: h5py.File, episode: Episode) -> None:
-        """The number of joints of each arm in every row, as RoboTwin's converter leaves it."""
+    def _write_joints(self, file: h5py.File, episode: Episode) -> None:
+        """The state, and the number of joints of each arm in every row, as RoboTwin's converter leaves it."""
+        file[QPOS] = episode.state  # (T, S) float32
         joints = episode.state.shape[1]
         if joints >= TWO_ARMS and joints % 2 == 0:
             for side in ("left", "right"):

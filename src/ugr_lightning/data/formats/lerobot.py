@@ -19,7 +19,7 @@ from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import Contents, EpisodeFormat, EpisodeLocation
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout, policy_cameras
 from ugr_lightning.data.storage.frames import FrameSource, SeveralSources
-from ugr_lightning.data.storage.lerobot_files import ACTION, CAMERA, INFO, STATE, write_dataset
+from ugr_lightning.data.storage.lerobot_files import ACTION, CAMERA, INFO, STATE, check_episodes, write_dataset
 from ugr_lightning.data.storage.tables import TablePictures, column_values, finite_rows, read_table
 from ugr_lightning.data.storage.video import VideoFrames, View, check_video
 from ugr_lightning.errors import DataError
@@ -108,6 +108,9 @@ class LeRobot(EpisodeFormat):
             extras=extras,
             label=f"episode{index}",
         )
+
+    def check(self, episodes: Sequence[Episode]) -> None:
+        check_episodes(episodes)
 
     def write(
         self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None

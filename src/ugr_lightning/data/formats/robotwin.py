@@ -279,17 +279,20 @@ class RoboTwin(NumberedFiles):
     def episode_file(self, folder: Path, index: int) -> Path:
         return episode_path(folder, index)
 
+    def check(self, episodes: Sequence[Episode]) -> None:
+        for episode in episodes:
+            joints, actions = episode.state.shape[1], episode.action.shape[1]
+            if actions != joints or joints < 4 or joints % 2:
+                got = f"{joints} states, {actions} actions"
+                expected = "two arms, each with a gripper, in states and actions alike"
+                raise DataError(episode.path, expected, got, "Convert to `act` instead.")
+
     def fill(self, file: h5py.File, episode: Episode) -> None:
         """Write an episode of another format: T steps give T + 1 frames, the last with the pictures of step T - 1.
 
         The label goes to `ugr/expert_action` where it is not the next state. Poses and cameras' parameters, which
         other formats do not have, are left out rather than made up. Pictures are compressed, unless they already were.
         """
-        joints = episode.state.shape[1]
-        if episode.action.shape != episode.state.shape or joints < 4 or joints % 2:
-            got = f"{joints} states, {episode.action.shape[1]} actions"
-            expected = "two arms, each with a gripper, in states and actions alike"
-            raise DataError(episode.path, expected, got, "Convert to `act` instead.")
         vector = np.concatenate([episode.state, episode.action[-1:]]).astype(np.float64)  # (T + 1, S)
         write_about(file, episode)
         _write_joints(file, vector)

@@ -23,6 +23,7 @@ from ugr_lightning.system.progress import Progress
 Cache = Literal["ram", "memmap", "none"]
 OPEN_EPISODES = 64
 """Files that `none` keeps open; systems allow 256 (macOS) or 1024 in all."""
+SHOWN_SIZES = 3  # of pictures, in an error
 
 
 class FrameStore(ABC):
@@ -102,25 +103,17 @@ def open_frames(
     """Make the frames of some episodes available.
 
     Args:
-        episodes: demonstrations, all with the same cameras and stored size.
+        episodes: demonstrations, all with the same cameras.
         cache: `ram` decodes once per run, `memmap` once for all runs and processes, `none` whenever a frame is used.
-        image_size: (height, width) to shrink to; None for the stored size.
+        image_size: (height, width) to shrink to; None for the stored size, which all pictures then have to share.
         folder: where a `memmap` goes, into a subfolder `.cache`; None for where our recordings have it.
 
     Raises:
-        DataError: episodes of different sizes, a frame that is no JPEG, a folder that cannot be written to.
-        ConfigError: a size larger than the stored one, or more frames than memory or disk can hold.
+        DataError: a frame that is no JPEG, a folder that cannot be written to.
+        ConfigError: no size where pictures differ in theirs, one larger than a stored one, or more frames than memory
+            or disk can hold.
     """
-    sizes = {episode.image_size for episode in episodes}
-    if len(sizes) != 1:
-        raise DataError(episodes[0].path.parent, "episodes of one image size", sorted(sizes), "Separate the folders.")
-    stored, cameras = sizes.pop(), episodes[0].frames.image_sizes
-    if image_size is None and len(set(cameras)) > 1:
-        fix = f"Give all of them one: `--data.image_size [{stored[0]},{stored[1]}]`."
-        raise ConfigError("data.image_size", "a size, as the cameras differ in theirs", sorted(set(cameras)), fix)
-    size = stored if image_size is None else (image_size[0], image_size[1])
-    if not (1 <= size[0] <= stored[0] and 1 <= size[1] <= stored[1]):
-        raise ConfigError("data.image_size", f"at most the stored size {stored}", size, "Record larger pictures.")
+    size = _choose_size(episodes, image_size)
     shape = (sum(episode.length for episode in episodes), len(episodes[0].cameras), *size, 3)
     if cache == "none":
         return FileStore(episodes, size)
@@ -137,6 +130,24 @@ def open_frames(
         home = folder or episodes[0].path.parent.parent
         return _open_memmap(episodes, shape, (home if home.is_dir() else home.parent) / ".cache")
     raise ConfigError("data.cache", "`ram`, `memmap` or `none`", cache, "Correct the name.")
+
+
+def _choose_size(episodes: Sequence[Episode], wanted: tuple[int, int] | None) -> tuple[int, int]:
+    """(height, width) of the pictures to deliver: the one wanted, or the one that every picture has."""
+    sizes: dict[tuple[int, int], str] = {}  # and where each is found first
+    for episode in episodes:
+        for camera, (height, width) in zip(episode.cameras, episode.frames.image_sizes, strict=True):
+            sizes.setdefault((height, width), f"{height}x{width} in {camera} of {episode.name} ({episode.path})")
+    stored = (min(height for height, _ in sizes), min(width for _, width in sizes))
+    if wanted is None and len(sizes) > 1:
+        got = ", ".join(list(sizes.values())[:SHOWN_SIZES]) + " ..." * (len(sizes) > SHOWN_SIZES)
+        fix = f"Give all pictures one: `--data.image_size [{stored[0]},{stored[1]}]`."
+        raise ConfigError("data.image_size", "a size, as the pictures differ in theirs", got, fix)
+    size = stored if wanted is None else (wanted[0], wanted[1])
+    if not (1 <= size[0] <= stored[0] and 1 <= size[1] <= stored[1]):
+        fix = "Choose a smaller size, or record larger pictures."
+        raise ConfigError("data.image_size", f"at most the stored size {stored}", size, fix)
+    return size
 
 
 def _open_memmap(episodes: Sequence[Episode], shape: tuple[int, ...], folder: Path) -> FrameStore:

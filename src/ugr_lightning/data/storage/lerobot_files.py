@@ -41,10 +41,7 @@ def write_dataset(folder: Path, episodes: Sequence[Episode], done: Callable[[int
         DataError: episodes that differ, that do not say their rate, or a folder with another dataset.
         ConfigError: pyarrow or PyAV is not installed, or there is nothing to write.
     """
-    import_pyarrow(), import_av()
-    if not episodes:
-        raise ConfigError("episodes", "at least one", "none", "Choose some.")
-    rate, features = _rate(episodes), _features(episodes)
+    rate, features = check_episodes(episodes)
     tasks = list(dict.fromkeys(map(_task, episodes)))
     starts = np.cumsum([0] + [episode.length for episode in episodes])
     info = _info(features, rate, len(episodes), int(starts[-1]), len(tasks))
@@ -60,6 +57,25 @@ def write_dataset(folder: Path, episodes: Sequence[Episode], done: Callable[[int
     pandas_index = {"task_index": list(range(len(tasks))), "task": tasks}
     publish(folder / TASKS, lambda partial: _write_table(partial, pandas_index, index_column="task"))
     _write_json(folder / INFO, info)
+
+
+def check_episodes(episodes: Sequence[Episode]) -> tuple[int, dict[str, dict[str, Any]]]:
+    """Find out whether episodes can be a dataset.
+
+    Args:
+        episodes: what is to be written.
+
+    Returns:
+        Their steps per second, and what every row has, in lerobot's words.
+
+    Raises:
+        DataError: episodes that differ, or that do not say one rate in whole steps per second.
+        ConfigError: pyarrow or PyAV is not installed, or there is nothing to write.
+    """
+    import_pyarrow(), import_av()
+    if not episodes:
+        raise ConfigError("episodes", "at least one", "none", "Choose some.")
+    return _rate(episodes), _features(episodes)
 
 
 def _path(pattern: str, index: int, key: str = "") -> str:
