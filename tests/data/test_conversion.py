@@ -231,6 +231,14 @@ def test_what_the_target_needs_is_asked_for_before_anything_is_written(name, mad
         assert len(convert(source, tmp_path / "out", name, rate=17)) == 2
 
 
+def test_a_stray_file_neither_renumbers_nor_goes_unmentioned(tmp_path, recording):
+    source = write_act(tmp_path / "source", 12, steps=4, name="demo_{}.hdf5")
+    shutil.copy(source / "demo_9.hdf5", source / "calibration.hdf5")
+    with pytest.warns(UserWarning, match=r"source: files that are taken for no episodes: calibration\.hdf5$"):
+        (only,) = convert(source, tmp_path / "out", "robotwin", selection=Selection(episodes=(2,)))
+    assert only.name == "demo_2"
+
+
 def test_a_full_disk_is_an_error_of_ours_and_the_next_run_goes_on(recording, tmp_path, monkeypatch):
     def full(path, write):
         if path.name == "episode_1.hdf5":

@@ -114,6 +114,13 @@ def test_reading_many_demonstrations_says_how_far_it_is(recording_root, monkeypa
     assert "click_alarmclock/demo_clean: 5/5" in capsys.readouterr().err
 
 
+def test_files_that_are_no_demonstrations_are_named(tmp_path, capsys):
+    folder = record(tmp_path, count=5)
+    (folder / "data" / "backup.hdf5").touch()
+    _data(tmp_path).prepare_data()
+    assert capsys.readouterr().err == f"{folder}: files that are taken for no demonstrations: backup.hdf5\n"
+
+
 def test_missing_episodes_are_recorded(tmp_path):
     data = _data(tmp_path, task="handover_block")
     asked = []

@@ -29,6 +29,17 @@ def test_all_three_spellings_of_episode_files_are_found_in_numerical_order(tmp_p
     assert find_episodes(tmp_path / "nowhere") == {}
 
 
+def test_a_file_without_a_number_does_not_change_those_of_others(tmp_path):
+    _touch(tmp_path, "b.hdf5", "a.h5")
+    assert {index: path.name for index, path in find_episodes(tmp_path).items()} == {0: "a.h5", 1: "b.hdf5"}
+    _touch(tmp_path, *(f"demo_{number}.hdf5" for number in (0, 1, 2, 3, 10, 11)), "calibration_7.hdf5")
+    found = {index: path.name for index, path in find_episodes(tmp_path).items()}
+    assert found == {n: f"demo_{n}.hdf5" for n in (0, 1, 2, 3, 10, 11)} | {7: "calibration_7.hdf5"}
+    _touch(tmp_path, "calibration_2.hdf5")
+    with pytest.raises(DataError, match=r"episode 2, got calibration_2.hdf5 and demo_2.hdf5. .*rename it"):
+        find_episodes(tmp_path)
+
+
 def test_two_files_for_one_episode_are_an_error(tmp_path):
     _touch(tmp_path, "episode1.hdf5", "episode_0000001.hdf5")
     with pytest.raises(DataError, match="one file for episode 1"):

@@ -1,6 +1,7 @@
 """What is said about demonstrations is true of them: measured on files in which the oddity was put."""
 
 import re
+import shutil
 
 import h5py
 import numpy as np
@@ -221,6 +222,16 @@ def test_pictures_of_a_later_episode_in_another_size_are_told_with_what_to_do(ma
         *(f"{camera} has different sizes: 20x32, 24x32" for camera in CAMERAS),
         "pictures differ in size: give them one with `data.image_size` to train on them",
     ]
+
+
+def test_files_that_are_no_episodes_are_named(make):
+    make(0)
+    folder = make(1)
+    for name in ("data/backup.hdf5", "data/episode1 (copy).hdf5", "data/demo_1.h5", "other.hdf5"):
+        shutil.copy(episode_path(folder, 1), folder / name)
+    names = "backup.hdf5, demo_1.h5, episode1 (copy).hdf5, other.hdf5"
+    assert oddities(folder) == [f"files that are taken for no episodes: {names}"]
+    assert oddities(episode_path(folder, 1)) == []
 
 
 def test_duplicates_gaps_and_leftovers_are_found(make):

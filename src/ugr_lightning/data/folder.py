@@ -26,30 +26,33 @@ def find_episodes(folder: Path) -> dict[int, Path]:
     return numbered_files(Path(folder) / "data")
 
 
+def hdf5_files(folder: Path) -> list[Path]:
+    """The HDF5 files of a folder in the order of their names; unfinished ones (`.partial`) are none."""
+    return sorted((path for path in Path(folder).glob("*") if path.suffix in ENDINGS), key=lambda path: path.name)
+
+
 def numbered_files(folder: Path) -> dict[int, Path]:
     """The episode files of a folder, by index, in order.
 
-    `episode7.hdf5`, `episode_0000007.hdf5`, `demo_7.h5`: the number at the end counts, whatever stands before it. Where
-    names begin in several ways, those with `episode` are the episodes; where none do, files are counted in the order of
-    their names. Unfinished files (`.partial`) are not episodes.
+    `episode7.hdf5`, `episode_0000007.hdf5`, `demo_7.h5`: the number at the end counts, whatever stands before it and
+    whatever else is there. Where there are such with `episode`, these are the episodes. Files without a number are
+    episodes only where none has one, counted in the order of their names.
 
     Raises:
         DataError: two files claim the same index.
     """
-    files = [path for path in Path(folder).glob("*") if path.suffix in ENDINGS]
-    files.sort(key=lambda path: path.name)
+    files = hdf5_files(folder)
     numbers = {path: match for path in files if (match := NUMBERED.fullmatch(path.stem))}
-    kinds = {match[1] for match in numbers.values()}
-    if OURS in kinds:
-        numbers = {path: match for path, match in numbers.items() if match[1] == OURS}
-    elif len(kinds) > 1 or len(numbers) < len(files):
+    if not numbers:
         return dict(enumerate(files))
+    numbers = {path: match for path, match in numbers.items() if match[1] == OURS} or numbers
     found: dict[int, Path] = {}
     for path, match in numbers.items():
         index = int(match[2])
         if index in found:
             got = f"{found[index].name} and {path.name}"
-            raise DataError(path.parent, f"one file for episode {index}", got, "Remove one of the two.")
+            fix = "The number at the end of a name counts: move one of the two elsewhere, or rename it."
+            raise DataError(path.parent, f"one file for episode {index}", got, fix)
         found[index] = path
     return dict(sorted(found.items()))
 

@@ -26,6 +26,7 @@ def find_oddities(found: Inspection, chunk_length: int) -> list[str]:
     looks: tuple[Iterable[str], ...] = (
         _numbering(found),
         _unfinished(found.folder),
+        _strays(found),
         _duplicates(found.seen),
         _short(found.seen, chunk_length),
         _without_colour(found),
@@ -58,6 +59,12 @@ def _unfinished(folder: Path) -> Iterable[str]:
     partial = sorted(path.name for path in folder.rglob("*.partial")) if folder.is_dir() else []
     if partial:
         yield f"unfinished files, left by something that was interrupted: {shorten(partial)}"
+
+
+def _strays(found: Inspection) -> Iterable[str]:
+    strays = found.form.strays(found.folder)
+    if strays:
+        yield f"files that are taken for no episodes: {shorten([path.name for path in strays])}"
 
 
 def _duplicates(seen: Sequence[SeenEpisode]) -> Iterable[str]:

@@ -46,6 +46,12 @@ def test_trajectories_of_several_files_are_counted_through(tmp_path):
     assert [FORMAT.read(found[index], CAMERAS).length for index in range(4)] == [2, 3, 4, 5]
 
 
+def test_files_without_trajectories_are_known(recording):
+    (recording / "damaged.h5").write_bytes(b"nothing")
+    assert list(FORMAT.find(recording)) == [0, 1, 2]
+    assert [path.name for path in FORMAT.strays(recording)] == ["damaged.h5"]
+
+
 def test_action_of_a_step_follows_its_observation_and_the_last_observation_is_dropped(recording):
     episode = read(recording, 2)
     np.testing.assert_array_equal(episode.state, waves(8, 14, 2)[:7])

@@ -13,7 +13,7 @@ from typing import ClassVar
 import h5py
 
 from ugr_lightning.data.episode import Episode
-from ugr_lightning.data.folder import find_episodes, numbered_files
+from ugr_lightning.data.folder import find_episodes, hdf5_files, numbered_files
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.data.storage.hdf5 import open_hdf5, write_hdf5
 from ugr_lightning.errors import ConfigError, DataError
@@ -92,6 +92,10 @@ class EpisodeFormat(ABC):
             DataError: the folder contradicts itself.
         """
 
+    def strays(self, folder: Path) -> list[Path]:
+        """Files that lie among the episodes and that `find` takes for none."""
+        return []
+
     @abstractmethod
     def peek(self, location: EpisodeLocation) -> Contents:
         """The cameras and columns of an episode.
@@ -163,6 +167,11 @@ class NumberedFiles(EpisodeFormat):
 
     def find(self, folder: Path) -> dict[int, EpisodeLocation]:
         return {index: EpisodeLocation(path) for index, path in episode_files(folder).items()}
+
+    def strays(self, folder: Path) -> list[Path]:
+        """HDF5 files that are not named as the episodes beside them are."""
+        episodes = set(episode_files(folder).values())
+        return [path for path in (*hdf5_files(folder / "data"), *hdf5_files(folder)) if path not in episodes]
 
     def write(
         self, folder: Path, episodes: Sequence[Episode], done: Callable[[int], None] = lambda index: None

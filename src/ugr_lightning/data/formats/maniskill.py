@@ -59,6 +59,10 @@ class ManiSkill(EpisodeFormat):
                 found[index] = EpisodeLocation(path, f"traj_{number}", seed=seed if isinstance(seed, int) else None)
         return found
 
+    def strays(self, folder: Path) -> list[Path]:
+        """Files without trajectories, or damaged ones."""
+        return [path for path in _files(folder) if not _trajectories(path)]
+
     def peek(self, location: EpisodeLocation) -> Contents:
         """The cameras by the names they have, and the joints by position."""
         with open_hdf5(location.path) as file:
