@@ -29,7 +29,9 @@ def fit(config, *options):
 
 
 def weights(folder, file="last.ckpt"):
-    return torch.load(folder / file, weights_only=True)["state_dict"]
+    """The averaged weights of a checkpoint and, where it has them, those that are trained."""
+    content = torch.load(folder / file, weights_only=True)
+    return content["state_dict"] | {f"trained {k}": v for k, v in content.get("training_state_dict", {}).items()}
 
 
 def scores(folder):
@@ -83,14 +85,27 @@ def test_two_fits_with_the_same_seed_agree_bit_for_bit_and_loader_workers_change
     assert all(torch.equal(a[name], b[name]) for name in a)
 
 
-def test_a_fit_that_goes_on_from_last_equals_the_uninterrupted_one(tiny_config, capsys):
-    fit(tiny_config, "--run", "straight", "--model.schedule", "constant")
-    fit(tiny_config, "--trainer.max_steps", "3", "--model.schedule", "constant")
-    fit(tiny_config, "--checkpoint", "last", "--model.schedule", "constant")
+@pytest.mark.parametrize(
+    ("config", "options", "limit"),
+    [
+        ("tiny_config", "", "max_steps"),
+        ("tiny_config", "--trainer.max_steps -1", "max_epochs"),
+        ("muon_config", "", "max_steps"),
+        ("muon_config", "--trainer.precision bf16-mixed --trainer.gradient_clip_val 1", "max_steps"),
+    ],
+)
+def test_a_fit_that_goes_on_from_last_equals_the_uninterrupted_one(config, options, limit, request, capsys):
+    part, whole = ("1", "2") if limit == "max_epochs" else ("3", "6")
+    config = request.getfixturevalue(config)
+    options = [*options.split(), "--model.schedule", "constant", f"--trainer.{limit}"]
+    fit(config, *options, whole, "--run", "straight")
+    fit(config, *options, part)
+    fit(config, *options, whole, "--checkpoint", "last")
     assert f"checkpoint: {RUN / 'last.ckpt'}" in capsys.readouterr().out
     straight = Path("runs/straight/version_0")
-    a, b = weights(RUN), weights(straight)
-    assert all(torch.equal(a[name], b[name]) for name in a)
+    for file in ("last.ckpt", "policy_best.ckpt"):
+        a, b = weights(RUN, file), weights(straight, file)
+        assert all(torch.equal(a[name], b[name]) for name in a), file
     assert scores(RUN) == scores(straight)
     assert not (RUN.parent / "version_1").exists(), "it went on in its own folder"
 
@@ -244,15 +259,6 @@ def muon_config(tiny_config):
     config["model"] = {"learning_rate": 1e-3, "muon_learning_rate": 1e-3, "policy": policy}
     Path(tiny_config).write_text(yaml.safe_dump(config))
     return tiny_config
-
-
-@pytest.mark.parametrize("options", [[], ["--trainer.precision", "bf16-mixed", "--trainer.gradient_clip_val", "1"]])
-def test_a_training_with_muon_that_goes_on_from_last_equals_the_uninterrupted_one(muon_config, options):
-    fit(muon_config, *options, "--run", "straight")
-    fit(muon_config, *options, "--trainer.max_steps", "3")
-    fit(muon_config, *options, "--checkpoint", "last")
-    a, b = weights(RUN), weights(Path("runs/straight/version_0"))
-    assert all(torch.equal(a[name], b[name]) for name in a)
 
 
 def test_muons_rate_may_change_on_the_way_and_is_said(muon_config, capsys):
