@@ -31,7 +31,8 @@ def test_import_act_writes_a_checkpoint_like_any_other(original, capsys):
     out = capsys.readouterr().out
     assert "is_pad_head.weight" in out
     assert "transformer.decoder.layers.6.* (18 tensors)" in out
-    policy, info = load_policy("ours.ckpt", cameras=("wrist", "top"))
+    policy, info = load_policy("ours.ckpt")
+    assert policy.cameras == ("top", "wrist")
     assert info.data == {"task": "click_alarmclock", "image_size": [480, 640], "state": "commanded"}
     images, state = seen()
     with torch.no_grad():

@@ -54,15 +54,6 @@ def test_a_score_that_only_knows_the_position_explains_nothing_within_it(arrays)
     assert np.isnan(kit.spearman_within_position(error, prior))
 
 
-def test_choice_equals_that_of_the_policy(arrays):
-    from ugr_lightning.models.refine.uncertainty import Uncertainty
-
-    error, score = arrays
-    known = ~np.isnan(error)
-    mask = Uncertainty(0.5).select(torch.tensor(score), torch.tensor(known), False).numpy()
-    assert np.array_equal(kit.choose(score, known, 6), mask)
-
-
 def test_recall_counts_the_common_steps(arrays):
     error, score = arrays
     for row, found in enumerate(kit.recall(error, score, 4)):

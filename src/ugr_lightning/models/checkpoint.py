@@ -173,26 +173,21 @@ def _first_line(error: Exception) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0][:160]
 
 
-def load_policy(path: Path | str, *, cameras: tuple[str, ...] | None = None) -> tuple[ChunkPolicy, PolicyInfo]:
+def load_policy(path: Path | str) -> tuple[ChunkPolicy, PolicyInfo]:
     """Rebuild a trained policy from one file, ready to predict.
 
     Args:
         path: checkpoint file from `ugr fit`, or folder from `ugr export --to safetensors`.
-        cameras: cameras the caller can provide; the policy's must be exactly these, in any order.
 
     Returns:
         The policy in evaluation mode (averaged weights where training averaged them), and what the file says.
 
     Raises:
-        CheckpointError: not such a file, unsafe, of a newer format, of a policy that cannot be, or made for other
-            cameras.
+        CheckpointError: not such a file, unsafe, of a newer format, or of a policy that cannot be.
     """
     path = Path(path)
     content = read_policy_folder(path) if path.is_dir() else read_checkpoint(path, mmap=True)
     description = _description(path, content)
-    if cameras is not None and set(cameras) != set(description["cameras"]):
-        fix = "Record or render exactly the cameras the policy was trained with."
-        raise CheckpointError(path, f"the cameras {sorted(cameras)}", sorted(description["cameras"]), fix)
     try:
         policy = rebuild(description["blueprint"])
     except (CheckpointError, ConfigError) as error:  # the latter of a constructor that was given what it refuses

@@ -11,6 +11,8 @@ FARTHEST = 3.0
 """The largest correction, in standard deviations of the displacement in training."""
 NEAR = 0.02
 """A point nearer to a camera's plane, m, is not in its picture."""
+CHANNELS = 24
+"""Of the first of four layers that look at a crop; the others have twice as many."""
 EDGE = 1.2
 """Where a crop's middle may be, in image units; 1 is the edge of the picture."""
 
@@ -40,18 +42,17 @@ class Zoom(nn.Module):
         cameras: V.
         axes: numbers that tell an orientation.
         levels: L, crops of each place; each shows twice as much as the one before it, half as fine.
-        channels: of the first of four layers.
 
     Source: RVT-2 (arXiv:2406.08545) looks a second time where a coarse stage points; docs/recipe.md (the second look).
     """
 
-    def __init__(self, side: int, cameras: int, axes: int, levels: int = 1, channels: int = 24) -> None:
+    def __init__(self, side: int, cameras: int, axes: int, levels: int = 1) -> None:
         super().__init__()
-        self.side, self.levels, wide, told = side, levels, 2 * channels, 64
+        self.side, self.levels, wide, told = side, levels, 2 * CHANNELS, 64
         self.eyes = nn.ModuleList(
             nn.Sequential(
-                *_layer(3, channels, 1),
-                *_layer(channels, wide, 2),
+                *_layer(3, CHANNELS, 1),
+                *_layer(CHANNELS, wide, 2),
                 *_layer(wide, wide, 2),
                 *_layer(wide, wide, 2),
                 nn.Flatten(),

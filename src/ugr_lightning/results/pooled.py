@@ -4,6 +4,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+RESAMPLES = 10_000
+"""How often seeds are drawn."""
+
 
 def holm(p_values: Sequence[float]) -> list[float]:
     """p-values corrected for their number, so that any error among all of them has the stated probability.
@@ -50,9 +53,7 @@ def sign_flip_test(differences: Sequence[int]) -> float:
     return min(1.0, float(chance[sums >= observed].sum()))
 
 
-def hierarchical_bootstrap(
-    a: Sequence[np.ndarray], b: Sequence[np.ndarray], *, resamples: int = 10_000, seed: int = 0
-) -> tuple[float, float]:
+def hierarchical_bootstrap(a: Sequence[np.ndarray], b: Sequence[np.ndarray], *, seed: int = 0) -> tuple[float, float]:
     """Interval of a difference of success rates, for other training seeds and other evaluation seeds.
 
     Draws training seeds of either policy, and evaluation seeds common to both, with replacement. Tasks stay as they
@@ -61,7 +62,6 @@ def hierarchical_bootstrap(
     Args:
         a: per task, outcomes (training seeds, evaluation seeds) of one policy, 0 or 1.
         b: the same of the other; its columns are the same evaluation seeds.
-        resamples: how often to draw.
         seed: of the draws.
 
     Returns:
@@ -79,16 +79,16 @@ def hierarchical_bootstrap(
     ):
         raise ValueError(f"outcomes of {[x.shape for x in a]} against {[y.shape for y in b]}")
     rng = np.random.default_rng(seed)
-    drawn = np.zeros(resamples)
+    drawn = np.zeros(RESAMPLES)
     for x, y in zip(a, b, strict=True):
-        columns = _weights(rng, resamples, x.shape[1])  # (resamples, evaluation seeds)
+        columns = _weights(rng, x.shape[1])  # (RESAMPLES, evaluation seeds)
         for outcomes, sign in ((x, 1.0), (y, -1.0)):
-            rows = _weights(rng, resamples, outcomes.shape[0])  # (resamples, training seeds)
+            rows = _weights(rng, outcomes.shape[0])  # (RESAMPLES, training seeds)
             drawn += sign * np.einsum("ir,rn,in->i", rows, outcomes.astype(float), columns, optimize=True) / len(a)
     low, high = np.quantile(drawn, [0.025, 0.975])
     return float(low), float(high)
 
 
-def _weights(rng: np.random.Generator, resamples: int, n: int) -> np.ndarray:
-    """How often each of n items occurs in a draw of n with replacement, as shares, (resamples, n)."""
-    return rng.multinomial(n, np.full(n, 1 / n), size=resamples) / n
+def _weights(rng: np.random.Generator, n: int) -> np.ndarray:
+    """How often each of n items occurs in a draw of n with replacement, as shares, (RESAMPLES, n)."""
+    return rng.multinomial(n, np.full(n, 1 / n), size=RESAMPLES) / n

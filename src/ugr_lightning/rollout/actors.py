@@ -132,17 +132,11 @@ class Zero(Actor):
 
 
 class Random(Actor):
-    """Commands a new pose around the first one every ten steps; the seed of the episode decides which.
-
-    Args:
-        reach: largest distance of a joint from the first pose, rad; grippers take any opening.
-        hold: control steps per pose.
-    """
+    """Commands a new pose every ten steps, the joints within 0.5 rad of the first one; the episode's seed decides."""
 
     name = "random"
 
-    def __init__(self, reach: float = 0.5, hold: int = 10) -> None:
-        self._reach, self._hold = reach, hold
+    def __init__(self) -> None:
         self._slots: dict[int, tuple[np.random.Generator, np.ndarray]] = {}
 
     def start(self, slot: int, seed: int, frame: FrameView) -> None:
@@ -153,9 +147,9 @@ class Random(Actor):
 
     def _pose(self, random: np.random.Generator, home: np.ndarray) -> np.ndarray:
         grippers = list(last_of_each_arm(len(home)))
-        pose = home + random.uniform(-self._reach, self._reach, len(home))  # (A,)
+        pose = home + random.uniform(-0.5, 0.5, len(home))  # (A,)
         pose[grippers] = random.uniform(0.0, 1.0, len(grippers))
-        return np.tile(pose.astype(np.float32), (self._hold, 1))  # (n, A)
+        return np.tile(pose.astype(np.float32), (10, 1))  # (n, A)
 
 
 class Expert(Actor):

@@ -61,10 +61,10 @@ def facing(side: str) -> float:
     return 0.0 if side == "left" else np.pi
 
 
-def grasp_yaw(side: str, object_yaw: float, symmetry: float = np.pi / 2.0) -> float:
-    """Gripper yaw that lines up with an object of rotational symmetry, closest to the arm's natural yaw."""
-    natural = facing(side)
-    return natural + (object_yaw - natural + symmetry / 2.0) % symmetry - symmetry / 2.0
+def grasp_yaw(side: str, object_yaw: float) -> float:
+    """Gripper yaw that lines up with a square object, closest to the arm's natural yaw."""
+    natural, quarter = facing(side), np.pi / 2.0
+    return natural + (object_yaw - natural + quarter / 2.0) % quarter - quarter / 2.0
 
 
 class Arms:

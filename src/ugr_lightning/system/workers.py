@@ -148,22 +148,22 @@ def wait_for_any(workers: Sequence[Worker], timeout_s: float) -> list[Worker]:
     return [links[link] for link in connection.wait(list(links), timeout_s)]  # type: ignore[index]
 
 
-def start_all(workers: Sequence[Worker], attempts: int = 2) -> None:
-    """Start workers side by side and wait until each has built its object.
+def start_all(workers: Sequence[Worker]) -> None:
+    """Start workers side by side and wait until each has built its object; one that does not is started once more.
 
     Raises:
-        SimulationError: one died or hung every time.
+        SimulationError: one died or hung both times.
         UGRError: what building the object raised.
     """
     for worker in workers:
         worker.launch()
     for worker in workers:
-        for attempt in range(1, attempts + 1):
+        for last in (False, True):
             try:
                 worker.receive(START_TIMEOUT_S)
                 break
             except WorkerLostError as error:
-                if attempt == attempts:
+                if last:
                     fix = "Run `ugr doctor`: it tests rendering apart and says what to install."
                     raise SimulationError(worker.name, "a simulator process that starts", error, fix) from error
                 worker.launch()

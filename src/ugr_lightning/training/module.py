@@ -17,6 +17,7 @@ from torchmetrics.regression import SpearmanCorrCoef
 from ugr_lightning.contract import Batch, Chunk, ChunkPolicy, Statistics
 from ugr_lightning.errors import ConfigError, NumericsError
 from ugr_lightning.models.checkpoint import describe
+from ugr_lightning.models.refine.ranked import highest
 from ugr_lightning.training.keyframe_error import MedianMetric, event_errors, known_kinematics
 from ugr_lightning.training.optimizer import MuonAndAdamW, Parts, parts_of
 
@@ -272,9 +273,7 @@ def found_by(refined: Tensor, error: Tensor, valid: Tensor) -> tuple[Tensor, Ten
         (B,) shares, 0 where nothing was chosen, and (B,) how many steps were.
     """
     chosen = (refined & valid).sum(1)  # (B,)
-    rank = error.masked_fill(~valid, -torch.inf).argsort(dim=1, descending=True, stable=True).argsort(dim=1)  # (B, K)
-    worst = (rank < chosen[:, None]) & valid  # (B, K)
-    return (worst & refined).sum(1) / chosen.clamp(min=1), chosen
+    return (highest(error, valid, chosen[:, None]) & refined).sum(1) / chosen.clamp(min=1), chosen
 
 
 def _scores() -> dict[str, Metric]:

@@ -8,9 +8,11 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+import torch
 from scipy import stats
 
 from ugr_lightning.errors import DataError
+from ugr_lightning.models.refine.ranked import highest
 
 LEVELS = (0.5, 0.6827, 0.9, 0.95)
 """Nominal shares of the intervals whose coverage is reported; the second is one standard deviation."""
@@ -79,23 +81,6 @@ def _correlation(a: np.ndarray, b: np.ndarray) -> float:
     return float(a @ b / scale) if scale > 1e-9 * len(a) else float("nan")
 
 
-def choose(score: np.ndarray, known: np.ndarray, budget: int) -> np.ndarray:
-    """The `budget` known steps of each sample with the highest score; of equal ones, the earlier.
-
-    Args:
-        score: (n, K).
-        known: (n, K) bool; a sample with fewer known steps has all of them chosen.
-        budget: M.
-
-    Returns:
-        (n, K) bool.
-    """
-    order = np.argsort(np.where(known, -score, np.inf), axis=1, kind="stable")[:, :budget]  # (n, M)
-    chosen = np.zeros(score.shape, bool)
-    np.put_along_axis(chosen, order, True, axis=1)
-    return chosen & known
-
-
 def recall(error: np.ndarray, score: np.ndarray, budget: int) -> np.ndarray:
     """Share of each sample's `budget` worst steps that the score would have chosen with the same budget.
 
@@ -106,10 +91,9 @@ def recall(error: np.ndarray, score: np.ndarray, budget: int) -> np.ndarray:
     Returns:
         (n,); NaN for a sample without known steps.
     """
-    known = ~np.isnan(error)
-    worst = choose(error, known, budget)
-    found = (worst & choose(score, known, budget)).sum(1)
-    return np.divide(found, worst.sum(1), out=np.full(len(error), np.nan), where=known.any(1))
+    known = torch.tensor(~np.isnan(error))
+    worst, chosen = (highest(torch.tensor(values), known, budget) for values in (error, score))
+    return ((worst & chosen).sum(1).double() / worst.sum(1)).numpy()
 
 
 def sparsification(error: np.ndarray, score: np.ndarray) -> np.ndarray:

@@ -68,7 +68,7 @@ MUTATIONS = [
     ("data.recording.noise_st", "noise_std"),
     ("average.decai", "decay"),
     ("rollout.every_n_step", "every_n_steps"),
-    ("rollout.on_missing_render", "on_missing_renderer"),
+    ("rollout.every_n_step", "every_n_steps"),
     ("checkpoints.monitr", "monitor"),
     ("figures.every_n_validation", "every_n_validations"),
     ("seed_everythin", "seed_everything"),

@@ -54,39 +54,14 @@ def test_has_a_yaml_that_trains_it(kind):
 
 
 @every_selector
-@pytest.mark.parametrize("training", [False, True])
-def test_spends_exactly_its_budget_on_a_whole_chunk(kind, training):
-    selector = kind()
-    mask = selector.select(scores(), whole(), training)
-    assert mask.shape == (6, STEPS)
-    assert mask.dtype == torch.bool
-    budget = selector.budget(STEPS)
-    if budget is not None:
-        assert mask.sum(1).tolist() == [budget] * 6
-
-
-@every_selector
-@pytest.mark.parametrize("training", [False, True])
-def test_never_chooses_a_padded_step(kind, training):
-    valid = torch.arange(STEPS)[None] < torch.tensor([50, 40, 20, 14, 3, 1])[:, None]
-    for _ in range(20):
-        assert not (kind().select(scores(), valid, training) & ~valid).any()
-
-
-@every_selector
-def test_is_deterministic_at_run_time_and_leaves_the_random_state_alone(kind):
+def test_chooses_known_steps_for_each_sample_by_itself_at_run_time_and_leaves_the_random_state_alone(kind):
     selector, state = kind(), torch.get_rng_state()
-    first = selector.select(scores(), whole(), False)
+    valid = torch.arange(STEPS)[None] < torch.tensor([50, 40, 20, 14, 3, 1])[:, None]
+    together = selector.select(scores(), valid, False)
+    alone = [selector.select(s[None], v[None], False) for s, v in zip(scores(), valid, strict=True)]
+    assert torch.equal(together, torch.cat(alone))
+    assert not (together & ~valid).any()
     assert torch.equal(state, torch.get_rng_state())
-    assert torch.equal(first, selector.select(scores(), whole(), False))
-
-
-@every_selector
-def test_chooses_for_each_sample_by_itself_at_run_time(kind):
-    selector = kind()
-    together = selector.select(scores(), whole(), False)
-    alone = torch.cat([selector.select(s[None], whole(1), False) for s in scores()])
-    assert torch.equal(together, alone)
 
 
 @every_selector

@@ -1,3 +1,4 @@
+import pytest
 import torch
 from lightning.pytorch import Callback
 from tiny import TinyPolicy, train
@@ -18,13 +19,17 @@ class Watch(Callback):
         self.validated.append(pl_module.policy.head.weight.detach().clone())
 
 
-def test_the_average_is_what_is_validated_and_saved(tmp_path):
+@pytest.mark.parametrize(
+    ("power", "moves"), [(None, lambda step: 1 - (1 + step) / (10 + step)), (0.75, lambda step: (1 + step) ** -0.75)]
+)
+def test_the_average_is_what_is_validated_and_saved(power, moves, tmp_path, monkeypatch):
+    monkeypatch.setattr("tiny.WeightAverage", lambda decay: WeightAverage(decay, power))
     watch, policy = Watch(), TinyPolicy()
     average = policy.head.weight.detach().clone()
     folder = tmp_path / "tiny" / "version_0"
     train(folder, policy, [watch], max_steps=5)
     for step, weight in enumerate(watch.steps, start=1):
-        average.lerp_(weight, 1 - min(0.9, (1 + step) / (10 + step)))
+        average.lerp_(weight, moves(step))
     saved = torch.load(folder / "last.ckpt", weights_only=True)
     assert torch.allclose(saved["state_dict"]["policy.head.weight"], average, atol=1e-6)
     assert torch.equal(saved["training_state_dict"]["policy.head.weight"], watch.steps[-1])
@@ -41,17 +46,6 @@ def test_with_a_power_the_average_spans_more_steps_the_longer_training_lasts():
     assert average.decay_at(30_000) < average.decay_at(300_000) == 0.9999
     assert WeightAverage(0.99).decay_at(1) == 2 / 11
     assert WeightAverage(0.99).decay_at(2000) == 0.99
-
-
-def test_the_power_decides_what_is_saved(tmp_path, monkeypatch):
-    monkeypatch.setattr("tiny.WeightAverage", lambda decay: WeightAverage(decay, power=0.75))
-    watch, policy = Watch(), TinyPolicy()
-    average = policy.head.weight.detach().clone()
-    train(tmp_path / "tiny" / "version_0", policy, [watch], max_steps=3)
-    for step, weight in enumerate(watch.steps, start=1):
-        average.lerp_(weight, (1 + step) ** -0.75)
-    saved = torch.load(tmp_path / "tiny" / "version_0" / "last.ckpt", weights_only=True)
-    assert torch.allclose(saved["state_dict"]["policy.head.weight"], average, atol=1e-6)
 
 
 def test_buffers_of_batch_normalisation_are_averaged_too(tmp_path):

@@ -109,13 +109,6 @@ def test_training_goes_on_with_one_warning_where_nothing_can_render(tmp_path, wo
     assert world == []
 
 
-def test_a_missing_renderer_can_be_an_error(tmp_path, world, monkeypatch):
-    monkeypatch.setattr("ugr_lightning.sim.render.require_rendering", no_renderer)
-    callback = RolloutEvaluation(every_n_steps=1, on_missing_renderer="error")
-    with pytest.raises(RenderError):
-        train(tmp_path / "tiny" / "version_0", callbacks=[callback], max_steps=5)
-
-
 @pytest.mark.parametrize("what", ["joints", "cameras"])
 def test_a_policy_of_another_robot_is_refused_before_the_first_step(what, tmp_path, world, monkeypatch):
     if what == "joints":

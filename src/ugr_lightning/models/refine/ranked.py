@@ -40,7 +40,19 @@ class Ranked(Selector):
 
     def select(self, log_variance: Tensor | None, valid: Tensor, training: bool) -> Tensor:
         scores = self.scores(log_variance, valid, training).expand(valid.shape)  # (B, K)
-        ranking = scores.masked_fill(~valid, -torch.inf).argsort(dim=1, descending=True, stable=True)  # ties: lower k
-        chosen = ranking[:, : self.budget(valid.shape[1])]  # (B, M)
-        mask = torch.zeros_like(valid).scatter(1, chosen, True)  # (B, K)
-        return mask & valid  # a chunk with fewer valid steps than M refines those it has
+        return highest(scores, valid, self.budget(valid.shape[1]))
+
+
+def highest(scores: Tensor, valid: Tensor, count: int | Tensor) -> Tensor:
+    """The steps with the highest score; of equal ones, the earlier.
+
+    Args:
+        scores: (B, K).
+        valid: (B, K) bool; of a sample with fewer valid steps than are asked for, these are chosen.
+        count: how many steps of every sample, or (B, 1) of each.
+
+    Returns:
+        (B, K) bool.
+    """
+    ranking = scores.masked_fill(~valid, -torch.inf).argsort(dim=1, descending=True, stable=True)  # ties: lower k
+    return (ranking.argsort(dim=1) < count) & valid

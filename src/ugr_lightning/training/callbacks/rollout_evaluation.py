@@ -36,8 +36,6 @@ class RolloutEvaluation(Callback):
         workers: simulator processes.
         task: task to roll out; null means that of the data.
         video: log the first episode as an animated GIF.
-        on_missing_renderer: `warn` once and train on without rollouts where nothing can render, or stop with an
-            `error`.
     """
 
     def __init__(
@@ -48,7 +46,6 @@ class RolloutEvaluation(Callback):
         workers: int = 2,
         task: str | None = None,
         video: bool = True,
-        on_missing_renderer: Literal["warn", "error"] = "warn",
     ) -> None:
         self.every_n_steps = every_n_steps
         self.episodes = episodes
@@ -56,7 +53,6 @@ class RolloutEvaluation(Callback):
         self.workers = workers
         self.task = task
         self.video = video
-        self.on_missing_renderer = on_missing_renderer
         self._last_step = 0
         self._simulators = Simulators()
 
@@ -98,8 +94,6 @@ class RolloutEvaluation(Callback):
 
             require_rendering(self.task)
         except (RenderError, ImportError) as error:
-            if self.on_missing_renderer == "error":
-                raise
             rank_zero_warn(f"Training goes on without rollouts. {error}")
             return False
         return True
