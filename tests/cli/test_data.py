@@ -48,7 +48,27 @@ def test_options_choose_what_is_looked_at(folder, capsys):
     assert "(2 columns;" in told
     assert "cam_left_wrist" not in told
     assert "shorter" not in told
-    assert Image.open("demo_clean.png").size == (12, 2 * 3 * 8)
+    assert Image.open("click_alarmclock-demo_clean.png").size == (12, 2 * 3 * 8)
+
+
+def test_a_contact_sheet_takes_the_place_of_its_own_only(folder, capsys):
+    for copy in ("a/hanging_mug/demo_clean", "b/hanging_mug/demo_clean", "b/open_microwave/demo_clean"):
+        shutil.copytree(folder, copy)
+    for _ in range(2):
+        assert main(["data", "inspect", "a/hanging_mug/demo_clean"]) == 0
+    assert main(["data", "inspect", "b/open_microwave/demo_clean/"]) == 0
+    assert main(["data", "inspect", "b/open_microwave/demo_clean/data/episode1.hdf5"]) == 0
+    names = ["hanging_mug-demo_clean", "open_microwave-demo_clean", "open_microwave-demo_clean-episode1"]
+    assert sorted(path.stem for path in Path().glob("*.png")) == names
+    Path("mine.png").write_text("mine")
+    before = {path: path.read_bytes() for path in Path().glob("*.png")}
+    capsys.readouterr()
+    for more in ([], ["--picture", "mine.png"], ["--picture", "a"]):
+        assert main(["data", "inspect", "b/hanging_mug/demo_clean", *more]) == 2
+        error = capsys.readouterr().err
+        assert "expected nothing, or an earlier contact sheet of b/hanging_mug/demo_clean" in error
+        assert "choose another place: `--picture FILE.png`" in error
+    assert {path: path.read_bytes() for path in Path().glob("*.png")} == before
 
 
 def test_an_unreadable_episode_is_the_exit_code(folder, capsys):

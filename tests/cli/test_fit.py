@@ -145,6 +145,20 @@ def test_a_training_that_cannot_start_leaves_no_run(tiny_config):
     assert not list(Path("runs").rglob("version_*"))
 
 
+@pytest.mark.parametrize("command", ["fit", "validate"])
+def test_demonstrations_that_were_moved_are_asked_for_by_name(tiny_config, tmp_path, capsys, command):
+    given = yaml.safe_load(Path(tiny_config).read_text())
+    given["data"]["folder"] = str(tmp_path / "moved")
+    Path("saved.yaml").write_text(yaml.safe_dump(given))
+    fit(tiny_config, "--trainer.max_steps", "1")
+    told = f"{tmp_path / 'moved'}: expected demonstrations, as `data.folder` in saved.yaml says, got nothing there."
+    options = ["--checkpoint", str(RUN / "last.ckpt")] if command == "validate" else []
+    assert main([command, "--config", "saved.yaml", *options]) == 2
+    assert f"{told} Say where they are: `--data.folder FOLDER`." in capsys.readouterr().err
+    assert main([command, "--config", "saved.yaml", *options, "--data.folder=nowhere"]) == 2
+    assert "nowhere: expected demonstrations, got nothing there. Say where they" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("resumed", [False, True])
 def test_a_config_that_was_saved_starts_a_run_of_its_own_from_any_folder(tiny_config, tmp_path, monkeypatch, resumed):
     root = yaml.safe_load(Path(tiny_config).read_text())["data"]["root"]

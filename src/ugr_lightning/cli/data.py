@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ugr_lightning.data.inspection import Inspection
 
 SAMPLED = 50  # demonstrations that are looked at where there are more
+HEAD_BYTES = 2**13  # of a contact sheet, with what it says of itself
 
 
 def inspect_data(
@@ -42,14 +43,16 @@ def inspect_data(
         episodes: only the first so many, or those with these numbers; null for all.
         all: look at every demonstration, however many there are.
         chunk_length: K of the policy that is to be trained; shorter episodes are listed.
-        picture: where the contact sheet goes; null means `<name>.png` in the working folder.
+        picture: where the contact sheet goes, in place of an earlier one of the same at most; null
+            means `TASK-SETTING.png`, after the last two folders, in the working folder.
     """
     from ugr_lightning.data.inspection import inspect_demonstrations
     from ugr_lightning.data.selection import Selection
     from ugr_lightning.system.progress import Progress
 
     place = Path(path)
-    sheet = Path(picture or f"{place.resolve().stem if place.is_file() else place.resolve().name}.png")
+    sheet = Path(picture or _sheet_name(place))
+    _check_sheet(sheet, place)
     with ExitStack() as stack:
         bars: list[Progress] = []
 
@@ -182,12 +185,41 @@ def _statistics(found: "Inspection") -> list[str]:
     return lines
 
 
+def _sheet_name(place: Path) -> str:
+    """What a contact sheet is called: `task-setting.png`, or `task-setting-episode7.png` of a single file."""
+    whole = place.resolve()
+    parts = [part for part in (whole.with_suffix("") if place.is_file() else whole).parts[1:] if part != "data"]
+    return "-".join(parts[-3:] if place.is_file() else parts[-2:]) + ".png"
+
+
+def _sheet_mark(place: Path) -> str:
+    """What a contact sheet says of itself, in the head of the file."""
+    return f"contact sheet of {place.resolve()}\n"
+
+
+def _check_sheet(sheet: Path, place: Path) -> None:
+    """Nothing may be where the contact sheet goes but an earlier one of the same demonstrations."""
+    if not place.exists() or not sheet.exists():
+        return
+    try:
+        with sheet.open("rb") as file:
+            got = None if _sheet_mark(place).encode() in file.read(HEAD_BYTES) else "another file"
+    except OSError as error:
+        got = str(error)
+    if got is not None:
+        fix = "Move it away, or choose another place: `--picture FILE.png`."
+        raise DataError(sheet, f"nothing, or an earlier contact sheet of {place}", got, fix)
+
+
 def _contact_sheet(found: "Inspection", path: Path) -> str:
     """Write a PNG of some steps and say what it shows; rows are steps, columns are cameras.
 
     Cameras of different sizes are shown at the size of the first.
     """
     from PIL import Image
+    from PIL.PngImagePlugin import PngInfo
+
+    from ugr_lightning.system.files import publish
 
     height, width = next(iter(found.seen[0].views.values())).size
     rows, said = [], []
@@ -197,9 +229,12 @@ def _contact_sheet(found: "Inspection", path: Path) -> str:
             same = [tile if tile.size == (width, height) else tile.resize((width, height)) for tile in tiles]
             rows.append(np.concatenate([np.asarray(tile) for tile in same], axis=1))  # (H, V W, 3)
         said.append(f"{one.index}: {', '.join(map(str, one.steps))}")
+    about = PngInfo()
+    about.add_itxt("Title", _sheet_mark(found.folder))
+    sheet = Image.fromarray(np.concatenate(rows, axis=0))
     path.parent.mkdir(parents=True, exist_ok=True)
     try:
-        Image.fromarray(np.concatenate(rows, axis=0)).save(path, format="PNG")
+        publish(path, lambda partial: sheet.save(partial, format="PNG", pnginfo=about))
     except OSError as error:
         raise DataError(path, "a place for the contact sheet", str(error), "Choose another: `--picture`.") from error
     return f"{path}: columns {', '.join(found.seen[0].views)}; rows episode: steps {'; '.join(said)}"

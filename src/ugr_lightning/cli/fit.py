@@ -22,9 +22,9 @@ from lightning.pytorch.utilities import rank_zero_only
 
 from ugr_lightning.cli.failures import explain_training
 from ugr_lightning.cli.parsing.call import at_home
-from ugr_lightning.cli.parsing.config import expand_includes, explain, flat, run_name
+from ugr_lightning.cli.parsing.config import config_of, expand_includes, explain, flat, run_name
 from ugr_lightning.data.datamodule import ChunkDataModule
-from ugr_lightning.errors import CheckpointError
+from ugr_lightning.errors import CheckpointError, DataError
 from ugr_lightning.models.checkpoint import read_checkpoint
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.limits import usable_cores
@@ -124,7 +124,7 @@ class UGRCLI(LightningCLI):
     """
 
     def __init__(self, args: list[str], default_run: str, held: ExitStack) -> None:
-        self.command, self.default_run, self.held = args[0], default_run, held
+        self.command, self.given, self.default_run, self.held = args[0], args, default_run, held
         strict: dict[str, Any] = {"exit_on_error": False, "allow_abbrev": False}
         super().__init__(
             PolicyModule,
@@ -295,9 +295,14 @@ class UGRCLI(LightningCLI):
         return _by_key(self._parser(self.subcommand), self.config[self.subcommand])
 
     def after_instantiate_classes(self) -> None:
-        """Let the data module record what is missing, with the simulator's help."""
+        """Let the data module record what is missing, with the simulator's help, unless it is to be elsewhere."""
         from ugr_lightning.cli.collect import check_recording, record_demonstrations
 
+        if self.datamodule.elsewhere and not self.datamodule.folder.exists():
+            config = config_of("data.folder", self.given)
+            expected = "demonstrations" + f", as `data.folder` in {config} says" * (config is not None)
+            fix = "Say where they are: `--data.folder FOLDER`."
+            raise DataError(self.datamodule.folder, expected, "nothing there", fix)
         self.datamodule.recorder = record_demonstrations
         check_recording(self.datamodule)
 

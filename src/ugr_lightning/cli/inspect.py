@@ -16,7 +16,8 @@ def _inspect(path: str, picture: str | None = None) -> int:
 
     Args:
         path: a `.ckpt` file, an exported folder, a folder of runs, or demonstrations, see `ugr data inspect`.
-        picture: for demonstrations, where the contact sheet goes; null means `<name>.png` in the working folder.
+        picture: for demonstrations, where the contact sheet goes, in place of an earlier one of the same at most; null
+            means `TASK-SETTING.png`, after the last two folders, in the working folder.
     """
     from ugr_lightning.cli.data import inspect_data
     from ugr_lightning.data.formats import recognise

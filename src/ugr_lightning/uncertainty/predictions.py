@@ -103,7 +103,7 @@ def batches(data: ChunkDataModule, episodes: tuple[int, ...], *, stride: int) ->
 
 
 def open_data(
-    policy: ChunkPolicy, trained: TrainingData, root: str, after_end: AfterEnd | None = None
+    policy: ChunkPolicy, trained: TrainingData, root: str, after_end: AfterEnd | None = None, named_by: str = ""
 ) -> ChunkDataModule:
     """The demonstrations a checkpoint was trained on, with its own split.
 
@@ -113,6 +113,7 @@ def open_data(
         root: folder of recordings, `data.root` of the training, or the task's own in it; where the training had a
             `data.folder`, that one.
         after_end: `mask` or `hold` in place of the checkpoint's own.
+        named_by: what says that they are there, for the error, where that is not who calls.
 
     Raises:
         DataError: the recording is not there, or its episodes are others than those of the checkpoint.
@@ -137,6 +138,9 @@ def open_data(
         folder=root if own or trained.get("elsewhere") else None,
         layout=Layout.of_training(trained),
     )
+    if not data.folder.exists():
+        expected = "the demonstrations of the checkpoint" + f", as {named_by} says" * bool(named_by)
+        raise DataError(data.folder, expected, "nothing there", "Say where they are: `--data FOLDER`.")
     data.setup()
     if data.split != trained["split"] or not _trained_with(policy, data):
         fix = "Give the folder with the recording that the policy was trained on, with --data."

@@ -110,6 +110,22 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return values
 
 
+def config_of(key: str, argv: Sequence[str]) -> str | None:
+    """The config that a value is from; None where the command line itself has it, or nothing has.
+
+    Args:
+        key: dotted, such as `data.folder`.
+        argv: command line, includes expanded.
+    """
+    found = None
+    for flag, value in pairwise([*argv, ""]):
+        if flag == "--config" and key in flat(yaml.safe_load(Path(value).read_text()) or {}):
+            found = value
+        elif flag.partition("=")[0] == f"--{key}":
+            found = None
+    return found
+
+
 def run_name(argv: Sequence[str]) -> str:
     """The name of a run when none is given: the names of its configs, e.g. `uncert-handover_block`.
 

@@ -35,7 +35,7 @@ def open_own(
     from ugr_lightning.results.evaluations import run_config
     from ugr_lightning.uncertainty.predictions import open_data
 
-    trained = info.trained_on
+    trained, named_by = info.trained_on, ""
     if data == OWN:
         config = (info.path if info.path.is_dir() else info.path.parent) / "config.yaml"
         named = flat(run_config(config))
@@ -44,7 +44,7 @@ def open_own(
         if place is None:
             got = f"no {config} that names it"
             raise ConfigError("--data", "the folder that the policy was trained on", got, "Give it: `--data FOLDER`.")
-        data = str(place)
-    opened = open_data(policy, trained, data, after_end)
+        data, named_by = str(place), f"{config}" if place is not usual else "the default of `data.root`"
+    opened = open_data(policy, trained, data, after_end, named_by)
     print(f"data: {opened.folder}")
     return opened
