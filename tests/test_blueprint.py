@@ -7,9 +7,11 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from deployed import tiny_act
 
 from ugr_lightning.blueprint import Blueprinted, rebuild
 from ugr_lightning.errors import CheckpointError, ConfigError
+from ugr_lightning.models.diffusion import DiffusionPolicy
 
 
 @dataclass(frozen=True)
@@ -199,3 +201,21 @@ def test_arguments_that_a_constructor_cannot_use_are_one_error(given):
 def test_only_classes_that_record_themselves_are_built(path):
     with pytest.raises(CheckpointError, match="class_path"):
         rebuild({"class_path": path, "init_args": {}})
+
+
+@pytest.mark.parametrize(
+    ("policy", "given"),
+    [
+        (tiny_act(), {"refine_branch": "mlp", "backbone_stride": 32, "state_noise": 0.0}),
+        (
+            DiffusionPolicy(unet_widths=(16, 32), backbone_width=8),
+            {"unet_kernel": 5, "unet_groups": 8, "step_dim": 128, "backbone_stride": 32},
+        ),
+    ],
+    ids=["ACT", "DiffusionPolicy"],
+)
+def test_blueprints_of_before_hold_arguments_that_are_gone(policy, given):
+    blueprint = policy.blueprint()
+    assert not given.keys() & blueprint["init_args"].keys()
+    blueprint["init_args"] |= given
+    assert rebuild(blueprint).state_dict().keys() == policy.state_dict().keys()

@@ -63,12 +63,15 @@ def test_a_contact_sheet_takes_the_place_of_its_own_only(folder, capsys):
     Path("mine.png").write_text("mine")
     before = {path: path.read_bytes() for path in Path().glob("*.png")}
     capsys.readouterr()
-    for more in ([], ["--picture", "mine.png"], ["--picture", "a"]):
+    for more in (["--picture", "hanging_mug-demo_clean.png"], ["--picture", "mine.png"], ["--picture", "a"]):
         assert main(["data", "inspect", "b/hanging_mug/demo_clean", *more]) == 2
         error = capsys.readouterr().err
         assert "expected nothing, or an earlier contact sheet of b/hanging_mug/demo_clean" in error
         assert "choose another place: `--picture FILE.png`" in error
     assert {path: path.read_bytes() for path in Path().glob("*.png")} == before
+    assert main(["data", "inspect", "b/hanging_mug/demo_clean"]) == 0
+    assert {path.name for path in Path().glob("*.png") if path not in before} == {"b-hanging_mug-demo_clean.png"}
+    assert {path: path.read_bytes() for path in before} == before
 
 
 def test_an_unreadable_episode_is_the_exit_code(folder, capsys):

@@ -137,7 +137,10 @@ def test_a_policy_is_called_by_its_selector_and_by_its_checkpoint_only_where_nam
     def column(*items):
         return [line.split("  ")[2].strip() for line in success_table(items).splitlines()[2:]]
 
-    uncert, block = (result(policy="ACT", checkpoint=64 * "a", refine=name) for name in ("Uncertainty", "Block"))
+    uncert = result(policy="ACT", checkpoint=64 * "a", refine="Uncertainty")
+    block = result(policy="ACT", checkpoint=64 * "d", refine="Block")
     plain, other = (result(policy="ACT", checkpoint=64 * letter) for letter in "bc")
     assert column(uncert, block, plain) == ["ACT Uncertainty", "ACT Block", "ACT"]
     assert column(plain, other, uncert) == ["ACT bbbbbbbb", "ACT cccccccc", "ACT Uncertainty"], "never put together"
+    before = result(policy="ACT", checkpoint=64 * "a")
+    assert column(before, uncert) == column(uncert, before) == ["ACT Uncertainty"], "lines of before do not say it"

@@ -186,10 +186,15 @@ def _statistics(found: "Inspection") -> list[str]:
 
 
 def _sheet_name(place: Path) -> str:
-    """What a contact sheet is called: `task-setting.png`, or `task-setting-episode7.png` of a single file."""
+    """What a contact sheet is called: `task-setting.png`, or `task-setting-episode7.png` of a single file.
+
+    With more of the path in front where another one has that name.
+    """
     whole = place.resolve()
     parts = [part for part in (whole.with_suffix("") if place.is_file() else whole).parts[1:] if part != "data"]
-    return "-".join(parts[-3:] if place.is_file() else parts[-2:]) + ".png"
+    shortest = 3 if place.is_file() else 2
+    names = ["-".join(parts[-count:]) + ".png" for count in range(shortest, max(len(parts), shortest) + 1)]
+    return next((name for name in names if _who_has(Path(name), place) is None), names[-1])
 
 
 def _sheet_mark(place: Path) -> str:
@@ -197,15 +202,20 @@ def _sheet_mark(place: Path) -> str:
     return f"contact sheet of {place.resolve()}\n"
 
 
-def _check_sheet(sheet: Path, place: Path) -> None:
-    """Nothing may be where the contact sheet goes but an earlier one of the same demonstrations."""
-    if not place.exists() or not sheet.exists():
-        return
+def _who_has(sheet: Path, place: Path) -> str | None:
+    """What keeps a contact sheet from being written; None where nothing does."""
+    if not sheet.exists():
+        return None
     try:
         with sheet.open("rb") as file:
-            got = None if _sheet_mark(place).encode() in file.read(HEAD_BYTES) else "another file"
+            return None if _sheet_mark(place).encode() in file.read(HEAD_BYTES) else "another file"
     except OSError as error:
-        got = str(error)
+        return str(error)
+
+
+def _check_sheet(sheet: Path, place: Path) -> None:
+    """Nothing may be where the contact sheet goes but an earlier one of the same demonstrations."""
+    got = _who_has(sheet, place) if place.exists() else None
     if got is not None:
         fix = "Move it away, or choose another place: `--picture FILE.png`."
         raise DataError(sheet, f"nothing, or an earlier contact sheet of {place}", got, fix)

@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -34,18 +35,20 @@ def hdf5_files(folder: Path) -> list[Path]:
 def numbered_files(folder: Path) -> dict[int, Path]:
     """The episode files of a folder, by index, in order.
 
-    `episode7.hdf5`, `episode_0000007.hdf5`, `demo_7.h5`: the number at the end counts, whatever stands before it and
-    whatever else is there. Where there are such with `episode`, these are the episodes. Files without a number are
-    episodes only where none has one, counted in the order of their names.
+    `episode7.hdf5`, `episode_0000007.hdf5`, `demo_7.h5`: the number at the end counts. Where there are such with
+    `episode`, these are the episodes, else those of one name that are more than half of all files. Where no name has so
+    many, all files are episodes, counted in the order of their names.
 
     Raises:
         DataError: two files claim the same index.
     """
     files = hdf5_files(folder)
     numbers = {path: match for path in files if (match := NUMBERED.fullmatch(path.stem))}
-    if not numbers:
+    called = Counter(match[1] for match in numbers.values())
+    name = OURS if OURS in called else max(called, key=called.__getitem__, default="")
+    if name != OURS and called[name] <= len(files) / 2:
         return dict(enumerate(files))
-    numbers = {path: match for path, match in numbers.items() if match[1] == OURS} or numbers
+    numbers = {path: match for path, match in numbers.items() if match[1] == name}
     found: dict[int, Path] = {}
     for path, match in numbers.items():
         index = int(match[2])

@@ -136,7 +136,7 @@ class Layout:
     def in_words(self) -> str:
         """Which joints were picked, as an error says it."""
         said = [f"`data.layout.{name}`" for name in ("state", "action") if isinstance(getattr(self, name), tuple)]
-        return f"those that {' and '.join(said) or 'no layout'} picked from the files of the training"
+        return f"those that {' and '.join(said)} picked from the files of the training"
 
     def dim(self, vector: Vector) -> int:
         """Length of one of the policy's vectors."""

@@ -148,15 +148,19 @@ def success_table(results: Sequence[EpisodeResult]) -> str:
     A policy is called by its class and its selector, and by the first digits of its checkpoint where several are called
     alike.
     """
-    groups: dict[tuple[str, str, tuple[str, str], str], list[EpisodeResult]] = {}
+    groups: dict[tuple[str, str, tuple[str, str | None], str], list[EpisodeResult]] = {}
+    names: dict[tuple[str, str | None], str] = {}
     for result in results:
-        policy = (result.policy + (f" {result.refine}" if result.refine else ""), (result.checkpoint or "")[:8])
+        policy = (result.policy, result.checkpoint)
         groups.setdefault((result.task, result.setting, policy, result.execution), []).append(result)
-    called = Counter(name for name, _ in {policy for _, _, policy, _ in groups})
+        if result.refine or policy not in names:  # lines of before do not say it
+            names[policy] = f"{result.policy} {result.refine or ''}".rstrip()
+    called = Counter(names.values())
     rows = [("task", "setting", "policy", "execution", "success", "95 % interval", "crashed")]
-    for (task, setting, (name, checkpoint), execution), group in groups.items():
-        policy_name = f"{name} {checkpoint}".rstrip() if called[name] > 1 else name
-        rows.append((task, setting, policy_name, execution, *summarize(group).cells()))
+    for (task, setting, policy, execution), group in groups.items():
+        name = names[policy]
+        name = f"{name} {(policy[1] or '')[:8]}".rstrip() if called[name] > 1 else name
+        rows.append((task, setting, name, execution, *summarize(group).cells()))
     return as_text(rows)
 
 

@@ -87,8 +87,8 @@ class Measurement(NamedTuple):
         value: the median, in `unit`.
         unit: of all that follow, but for the ratio.
         cpu: the same by processor time instead of wall-clock time; None where several processes work.
-        arithmetic: how long its floating-point operations take in one large matrix product, measured in turns with it;
-            None where they are not counted. No exact change of a program makes it faster than that.
+        arithmetic: how long its floating-point operations take in large matrix products, measured in turns with it:
+            about what no exact change of the program undercuts; None where they are not counted.
         reference: the median of what it is compared with, measured in turns with it; None where there is nothing.
         ratio: how many times better than the reference; None without one.
         aim: what the project promises, as a sentence fragment.

@@ -68,7 +68,6 @@ MUTATIONS = [
     ("data.recording.noise_st", "noise_std"),
     ("average.decai", "decay"),
     ("rollout.every_n_step", "every_n_steps"),
-    ("rollout.every_n_step", "every_n_steps"),
     ("checkpoints.monitr", "monitor"),
     ("figures.every_n_validation", "every_n_validations"),
     ("seed_everythin", "seed_everything"),
@@ -109,6 +108,17 @@ def test_a_wrong_value_is_one_paragraph_that_names_the_key(option, key, capsys):
 def test_an_overlay_for_another_policy_is_answered_with_the_one_that_is_meant(capsys):
     assert main(["fit", "--config", "dp", "--config", "keyframes/act"]) == 2
     assert "`keyframes/act` sets it: did you mean `--config keyframes/dp`?" in capsys.readouterr().err
+
+
+def test_the_config_of_an_older_run_is_told_what_is_gone_all_at_once(tmp_path, capsys):
+    old = tmp_path / "config.yaml"
+    gone = {"refine_branch": "mlp", "state_noise": 0.0}
+    policy = {"class_path": "ugr_lightning.models.act.ACT", "init_args": gone}
+    old.write_text(yaml.safe_dump({"model": {"policy": policy}, "rollout": {"on_missing_renderer": "warn"}}))
+    assert main(["fit", "--config", str(old)]) == 2
+    said = capsys.readouterr().err
+    assert f"An older version wrote {old}: delete these keys there" in said
+    assert "refine_branch mlp, state_noise 0.0, on_missing_renderer warn" in said
 
 
 RULES = """

@@ -94,6 +94,8 @@ def test_keeps_its_promises_and_leaves_the_random_state_alone(kind, steps):
     selector, state = kind(), torch.get_rng_state()
     assert checked_budget(selector, steps, uncertain=True) == selector.budget(steps)
     assert torch.equal(state, torch.get_rng_state())
+    in_training = selector.select(scores()[:, :steps], whole()[:, :steps], True).sum(1)
+    assert set(in_training.tolist()) <= {selector.budget(steps)}, "as many in training"
 
 
 class Mine(Selector):

@@ -179,8 +179,21 @@ def explain(error: Exception, parser: ArgumentParser | None, argv: Sequence[str]
         key.rpartition(".")[2], {k.rpartition(".")[2] for k in known}, n=3
     )
     fix = f"Did you mean {_either(near)}?" if near else "`--help` and `--print_config` list the keys."
-    fix = _overlay_for_another(key, argv) or fix
+    fix = _written_before(key, argv) or _overlay_for_another(key, argv) or fix
     return ConfigError(key, "a known key", "an unknown one" + _context(message, key), fix)
+
+
+def _written_before(key: str, argv: Sequence[str]) -> str | None:
+    """What to delete from the config of an older run, which has keys that are gone; None where this is none of them."""
+    for path in (Path(value) for flag, value in pairwise(argv) if flag == "--config"):
+        content = flat(yaml.safe_load(path.read_text()) or {})
+        policy = _imported(str(content.get("model.policy.class_path", "")))
+        gone = {"on_missing_renderer": "warn", **getattr(policy, "retired", {})}
+        there = [one for one in content if one.rpartition(".")[2] in gone]
+        if key.rpartition(".")[2] in gone and there:
+            means = ", ".join(f"{one.rpartition('.')[2]} {gone[one.rpartition('.')[2]]}" for one in there)
+            return f"An older version wrote {path}: delete these keys there, they cannot be chosen any more ({means})."
+    return None
 
 
 def _overlay_for_another(key: str, argv: Sequence[str]) -> str | None:
