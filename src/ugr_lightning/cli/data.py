@@ -293,7 +293,7 @@ def convert_data(
         selection = Selection(tasks or (), episodes)
         options = {"cameras": cameras, "layout": layout, "rate": rate, "selection": selection}
         found = convert(Path(source), Path(target), to, done=done, **options)  # type: ignore[arg-type]
-    lost = left_out(find_format(to), Path(target), found)
+        lost = left_out(find_format(to), Path(target), found, done)
     steps = sum(episode.length for episode in found)
     print(f"{target}: {len(found)} episodes, {steps} steps as {to}; states and actions are the same to the bit")
     print(f"cameras     {', '.join(found[0].cameras)}")

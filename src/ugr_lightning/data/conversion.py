@@ -196,19 +196,23 @@ def _read_back(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -
         yield form.read(location, given.cameras, layout), given
 
 
-def left_out(form: EpisodeFormat, target: Path, episodes: Sequence[Episode]) -> list[str]:
+def left_out(
+    form: EpisodeFormat, target: Path, episodes: Sequence[Episode], done: Done = lambda what, number, total: None
+) -> list[str]:
     """What the source says of any episode and the target does not give back as it was, by name.
 
     Args:
         form: the format written.
         target: the folder written.
         episodes: as `convert` returns them.
+        done: as for `convert`.
     """
     fields = ("seed", "measured", "endpose", "projection")
     lost: set[str] = set()
-    for both in _read_back(form, target, episodes):
+    for number, both in enumerate(_read_back(form, target, episodes), start=1):
         kept, known = ({**{name: getattr(of, name) for name in fields}, **of.extras} for of in both)
         lost |= {name for name, value in known.items() if value is not None and not _same(value, kept.get(name))}
+        done("comparing", number, len(episodes))
     return sorted(lost)
 
 
