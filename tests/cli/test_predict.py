@@ -34,23 +34,6 @@ def test_an_imported_policy_says_that_its_episodes_are_not_known(name, tmp_path,
     assert "the episodes it was trained on, got no episodes" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("command", ["predict", "analyze", "refine", "sweep"])
-@pytest.mark.parametrize("kind", ["root", "folder"])
-def test_demonstrations_that_were_moved_are_asked_for_by_name(
-    command, kind, ten_demonstrations, untrained, tiny_act, tmp_path, capsys
-):
-    own = ten_demonstrations / "click_alarmclock" / "demo_clean"
-    path = untrained(tiny_act(), tmp_path, {kind: str(own if kind == "folder" else ten_demonstrations)})
-    config = tmp_path / "config.yaml"
-    config.write_text(f"data: {{{kind}: {own if kind == 'folder' else ten_demonstrations}}}")
-    own.rename(tmp_path / "moved")
-    assert main([command, str(path)]) == 2
-    told = f"{own}: expected the demonstrations of the checkpoint, as {config} says, got nothing there."
-    assert f"{told} Say where they are: `--data FOLDER`." in capsys.readouterr().err
-    assert main([command, str(path), "--data", str(tmp_path / "nowhere")]) == 2
-    assert "expected the demonstrations of the checkpoint, got nothing there. Say" in capsys.readouterr().err
-
-
 def test_it_writes_errors_by_command_and_pictures_of_both_parts(command, capsys, tmp_path):
     assert main([*command, "--pictures", "1"]) == 0
     said = capsys.readouterr().out

@@ -33,7 +33,19 @@ def test_what_a_run_was_trained_on_is_found_and_said(name, key, run, ten_demonst
 
 def test_a_folder_that_is_given_wins(run, tmp_path, capsys):
     assert main(["refine", str(run("root")), "--data", "elsewhere"]) == 2
-    assert "elsewhere/click_alarmclock/demo_clean: expected 10 demonstrations" in capsys.readouterr().err
+    told = "elsewhere/click_alarmclock/demo_clean: expected the demonstrations of the checkpoint, got nothing there."
+    assert f"{told} Say where they are: `--data FOLDER`." in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("key", ["root", "folder"])
+@pytest.mark.parametrize("name", COMMANDS)
+def test_where_they_were_moved_it_is_said_what_named_the_folder(name, key, run, ten_demonstrations, capsys):
+    checkpoint, own = run(key), ten_demonstrations / "click_alarmclock" / "demo_clean"
+    own.rename(own.with_name("moved"))
+    assert main([name, str(checkpoint)]) == 2
+    config = checkpoint.with_name("config.yaml")
+    told = f"{own}: expected the demonstrations of the checkpoint, as {config} says, got nothing there."
+    assert f"{told} Say where they are: `--data FOLDER`." in capsys.readouterr().err
 
 
 def test_where_no_config_names_it_the_usual_folder_is_looked_into_unless_it_was_another(run, capsys):
