@@ -244,13 +244,16 @@ def test_what_is_learned_by_may_change_on_the_way_and_is_said(tiny_config, capsy
 
 def test_the_settings_before_a_change_stay_beside_those_of_the_end(tiny_config):
     fit(tiny_config, "--trainer.max_steps", "3", "--seed_everything", "4")
-    first = (RUN / "config.yaml").read_text()
+    first, reached = (RUN / "config.yaml").read_text(), (RUN / "last.ckpt").read_bytes()
     again = ["--checkpoint", "last", "--seed_everything"]
     fit(tiny_config, "--trainer.max_steps", "6", *again, "5")
     assert (RUN / "config-to-step3.yaml").read_text() == first
     assert yaml.safe_load((RUN / "config.yaml").read_text())["seed_everything"] == 5
     fit(tiny_config, "--trainer.max_steps", "6", *again, "6")
     assert yaml.safe_load((RUN / "config.yaml").read_text())["seed_everything"] == 5, "nothing was trained with 6"
+    (RUN / "last.ckpt").write_bytes(reached)  # as if the second start had been killed
+    fit(tiny_config, "--trainer.max_steps", "6", *again, "7")
+    assert (RUN / "config-to-step3.yaml").read_text() == first
 
 
 def test_the_same_episodes_in_other_words_are_no_others(tiny_config, capsys):
