@@ -124,7 +124,7 @@ def test_names_follow_what_is_picked():
     assert Layout(state=(2, "b", Joint(0))).names(names, "action") == ("c", "b", "a")
 
 
-def test_a_layout_is_plain_where_no_joint_is_picked():
-    assert Layout(cameras={"cam_high": "front"}, state=7).plain
-    assert not Layout(state=(0, 1)).plain
-    assert not Layout(action=(0, 1)).plain
+def test_columns_in_their_order_are_not_picked():
+    assert Layout(cameras={"cam_high": "front"}, state=7, action=(0, 1)).picked == []
+    assert Layout(state=(1, 0)).picked == ["state"]
+    assert Layout(state=(Joint(0, scale=2.0), 1), action=("waist",)).picked == ["state", "action"]

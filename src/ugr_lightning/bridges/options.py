@@ -55,12 +55,13 @@ def deployment_of(
         refine_ratio=number(config, "refine_ratio"),
     )
     layout = Layout.of_training(deployment.info.data)
-    if not layout.plain and not _switch(config, "ignore_layout"):
+    if layout.picked and not _switch(config, "ignore_layout"):
         fix = (
             "Where the environment has its joints in the policy's order and units, and only the files of the training "
             "had not, say so with `ignore_layout`."
         )
-        raise CheckpointError(checkpoint, "joints as the environment has them", layout.in_words(), fix)
+        got = f"those that `data.layout.{'` and `'.join(layout.picked)}` picked from the files of the training"
+        raise CheckpointError(checkpoint, "joints as the environment has them", got, fix)
     for camera in set(deployment.cameras) & set(layout.cameras) - set(named):
         theirs, usual = layout.cameras[camera], deployment.cameras[camera]
         if theirs not in (camera, usual, *OTHER_NAMES.get(camera, ())):

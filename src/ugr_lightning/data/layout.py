@@ -116,9 +116,10 @@ class Layout:
         return self.dim("action")
 
     @property
-    def plain(self) -> bool:
-        """Whether the policy's vectors are the file's, all columns as they are."""
-        return isinstance(self.state, int) and (self.action is None or isinstance(self.action, int))
+    def picked(self) -> list[Vector]:
+        """Which of the policy's vectors are other than the file's columns as they are, from the first on."""
+        given: dict[Vector, Any] = {"state": self.state, "action": self.action}
+        return [v for v, joints in given.items() if isinstance(joints, tuple) and joints != tuple(range(len(joints)))]
 
     def names(self, columns: Sequence[str], vector: Vector) -> tuple[str, ...]:
         """What the policy's numbers are called: as in the file, or as they are picked from it.
@@ -132,11 +133,6 @@ class Layout:
             return tuple(columns) if len(columns) == wanted else tuple(map(str, range(wanted)))
         sources = [joint.source if isinstance(joint, Joint) else joint for joint in wanted]
         return tuple(columns[s] if isinstance(s, int) and s < len(columns) else str(s) for s in sources)
-
-    def in_words(self) -> str:
-        """Which joints were picked, as an error says it."""
-        said = [f"`data.layout.{name}`" for name in ("state", "action") if isinstance(getattr(self, name), tuple)]
-        return f"those that {' and '.join(said)} picked from the files of the training"
 
     def dim(self, vector: Vector) -> int:
         """Length of one of the policy's vectors."""

@@ -133,7 +133,7 @@ def checkpoint_actor(
     """
     require_fit(policy, task)
     name, data = type(policy).__name__, info.data
-    if not Layout.of_training(data).plain:
+    if Layout.of_training(data).picked:
         warnings.warn(
             "`data.layout` picked the policy's joints from those of the files it was trained on: unless it gave them "
             f"the order and units of the robot of {task}, success says little.",
