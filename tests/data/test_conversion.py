@@ -234,7 +234,7 @@ def test_what_the_target_needs_is_asked_for_before_anything_is_written(name, mad
 def test_a_stray_file_neither_renumbers_nor_goes_unmentioned(tmp_path, recording):
     source = write_act(tmp_path / "source", 12, steps=4, name="demo_{}.hdf5")
     shutil.copy(source / "demo_9.hdf5", source / "calibration.hdf5")
-    with pytest.warns(UserWarning, match=r"source: files that are taken for no episodes: calibration\.hdf5$"):
+    with pytest.warns(UserWarning, match=r"source: files that are taken for no demonstrations: calibration\.hdf5$"):
         (only,) = convert(source, tmp_path / "out", "robotwin", selection=Selection(episodes=(2,)))
     assert only.name == "demo_2"
 

@@ -230,7 +230,7 @@ def test_files_that_are_no_episodes_are_named(make):
     for name in ("data/backup.hdf5", "data/episode1 (copy).hdf5", "data/demo_1.h5", "other.hdf5"):
         shutil.copy(episode_path(folder, 1), folder / name)
     names = "backup.hdf5, demo_1.h5, episode1 (copy).hdf5, other.hdf5"
-    assert oddities(folder) == [f"files that are taken for no episodes: {names}"]
+    assert oddities(folder) == [f"files that are taken for no demonstrations: {names}"]
     assert oddities(episode_path(folder, 1)) == []
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import EpisodeFormat, detect, find_format, formats
 from ugr_lightning.data.layout import Layout
-from ugr_lightning.data.selection import ALL, Selection, shorten
+from ugr_lightning.data.selection import ALL, Selection, told_strays
 from ugr_lightning.errors import ConfigError, DataError
 from ugr_lightning.system.files import publish_text
 from ugr_lightning.system.lock import flock
@@ -124,9 +124,8 @@ def _read_all(
     locations = list(selection.choose(form.find(source), source).values())
     if not locations:
         raise DataError(source, f"demonstrations of {form.name}", "none", "Check the path.")
-    strays = [path.name for path in form.strays(source)]
-    if strays:
-        warnings.warn(f"{source}: files that are taken for no episodes: {shorten(strays)}", stacklevel=3)
+    for told in told_strays(form.strays(source)):
+        warnings.warn(f"{source}: {told}", stacklevel=3)
     contents = form.peek(locations[0])
     found = []
     for number, location in enumerate(locations, start=1):

@@ -18,7 +18,7 @@ from ugr_lightning.data.episode import Episode
 from ugr_lightning.data.formats import RECORDED, EpisodeFormat, EpisodeLocation, detect, episode_files, recognise
 from ugr_lightning.data.layout import DEFAULT_LAYOUT, Layout
 from ugr_lightning.data.sampling import BatchSampler, EpochOrder, Sampling
-from ugr_lightning.data.selection import Selection, count_tasks, describe_tasks, shorten
+from ugr_lightning.data.selection import Selection, count_tasks, describe_tasks, told_strays
 from ugr_lightning.data.split import Split, split_episodes
 from ugr_lightning.data.statistics import compute_statistics
 from ugr_lightning.data.storage.cache import Cache, open_frames
@@ -239,8 +239,7 @@ class ChunkDataModule(lightning.LightningDataModule):
         tasks = count_tasks(chosen.values())
         words = [f"{len(chosen)} of {present} demonstrations are used (`data.episodes`)"] * (len(chosen) < present)
         words += [f"{len(tasks)} tasks are mixed: {describe_tasks(tasks)} (`data.tasks`)"] * (len(tasks) > 1)
-        strays = [path.name for path in form.strays(self.folder)]
-        words += [f"files that are taken for no demonstrations: {shorten(strays)}"] * bool(strays)
+        words += told_strays(form.strays(self.folder))
         if words:
             print(f"{self.folder}: {'; '.join(words)}", file=sys.stderr)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ugr_lightning.data.inspection import Inspection, SeenEpisode, fits_swapped
-from ugr_lightning.data.selection import shorten
+from ugr_lightning.data.selection import shorten, told_strays
 from ugr_lightning.embodiment import GRIPPERS, STATE_DIM
 
 STILL = 1e-4  # a joint that moves less than this in all episodes is constant, in its own units
@@ -26,7 +26,7 @@ def find_oddities(found: Inspection, chunk_length: int) -> list[str]:
     looks: tuple[Iterable[str], ...] = (
         _numbering(found),
         _unfinished(found.folder),
-        _strays(found),
+        told_strays(found.form.strays(found.folder)),
         _duplicates(found.seen),
         _short(found.seen, chunk_length),
         _without_colour(found),
@@ -59,12 +59,6 @@ def _unfinished(folder: Path) -> Iterable[str]:
     partial = sorted(path.name for path in folder.rglob("*.partial")) if folder.is_dir() else []
     if partial:
         yield f"unfinished files, left by something that was interrupted: {shorten(partial)}"
-
-
-def _strays(found: Inspection) -> Iterable[str]:
-    strays = found.form.strays(found.folder)
-    if strays:
-        yield f"files that are taken for no episodes: {shorten([path.name for path in strays])}"
 
 
 def _duplicates(seen: Sequence[SeenEpisode]) -> Iterable[str]:

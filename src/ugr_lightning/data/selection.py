@@ -99,6 +99,12 @@ def ranges(numbers: Iterable[int]) -> str:
     return shorten([" to ".join(map(str, run)) for run in runs])
 
 
+def told_strays(strays: Sequence[Path]) -> list[str]:
+    """One line where files lie among demonstrations that are taken for none; see `EpisodeFormat.strays`."""
+    names = shorten([path.name for path in strays])
+    return [f"files that are taken for no demonstrations: {names}"] if strays else []
+
+
 def shorten(values: Sequence[object], most: int = 8) -> str:
     """A list in words, the first of it where it is long."""
     return ", ".join(map(str, values[:most])) + (f" and {len(values) - most} more" if len(values) > most else "")
